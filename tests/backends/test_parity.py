@@ -51,10 +51,10 @@ def test_the_drive_moves_every_stage(luvmi):
     assert np.abs(luvmi.of["flat, soft"][0].stages["housing_heat"]).max() > 1e-3
 
 
-def test_soil_too_stiff_for_a_drive_damps_alike(luvmi, monkeypatch):
-    """Little inertia and a short relaxation length: both engines cut the damping time, and by the same."""
+def test_soil_too_stiff_for_a_drive_damps_alike_and_creeps_alike(luvmi, monkeypatch):
+    """Little inertia and a short relaxation length: both engines cut the damping time, and by the same; soil creeps."""
     rotor = np.asarray(luvmi.model.parameters["motor"]["rotor_inertia"])
-    model = luvmi.model.set("motor", rotor_inertia=tuple(0.1 * rotor)).set("shear_state", relaxation=0.05)
+    model = luvmi.model.set("motor", rotor_inertia=tuple(0.1 * rotor)).set("shear_state", relaxation=0.05, creep=0.05)
     case = luvmi.cases[0]
     samples = luvmi.of[case.name][0]
     native, structured = (

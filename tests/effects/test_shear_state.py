@@ -26,9 +26,7 @@ COUNT = 1000
 
 
 @jax.jit
-def _step(
-    dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state: Any, damping_time: Any, relaxation: Any
-) -> Any:
+def _step(dt: Any, v_x: Any, v_y: Any, rim: Any, sinkage: Any, rock: Any, state: Any, **parameters: Any) -> Any:
     zero = jnp.zeros_like(v_x)
     nil = Vec3(zero, zero, zero)
     contact = Contact(sinkage, zero, zero, zero, v_x, v_y, rim, nil, nil, nil, zero == 0, zero, zero)
@@ -43,7 +41,7 @@ def _step(
         geometry=nominal_geometry(rover_info(RADIUS + zero, zero)),
         rover=rover_info(RADIUS + zero, zero),
     )
-    parameters = SimpleNamespace(**{**shear_state.nominal(), "damping_time": damping_time, "relaxation": relaxation})
+    parameters = SimpleNamespace(**{**shear_state.nominal(), **parameters})
     first = initial_wheel(contact)
     wheel, new = shear_state.ports["wheel_shear"](ctx, parameters, SimpleNamespace(**state), first)
     return new, (wheel.slip_x, wheel.slip_y, wheel.direction), (first.slip_x, first.slip_y, first.direction)
@@ -75,8 +73,9 @@ def step(
             cast(sinkage),
             cast(more.get("rock", 0.0)),
             {k: cast(v) for k, v in state.items()},
-            jnp.asarray(more.get("damping_time", 0.1), dtype),
-            jnp.asarray(more.get("relaxation", 1.0), dtype),
+            damping_time=jnp.asarray(more.get("damping_time", 0.1), dtype),
+            relaxation=jnp.asarray(more.get("relaxation", 1.0), dtype),
+            creep=jnp.asarray(more.get("creep", 0.0), dtype),
         )
         return jax.tree.map(lambda a: np.asarray(a, float), out)
 
@@ -172,6 +171,24 @@ def test_damping_adds_what_the_soil_is_sheared_in_the_damping_time() -> None:
     assert np.array_equal(seen[0], state["slip_x"])
     state, seen, _ = step(0.002, np.full(COUNT, 10.0), 0.0, 12.0, damping_time=0.1)
     assert seen[0] == pytest.approx(state["slip_x"], rel=1e-6)
+
+
+def test_soil_that_creeps_holds_a_wheel_at_rest_by_its_slip_speed_over_that_of_the_creep() -> None:
+    """From rest 1 - exp(-1) of it is there after L / creep; without creep, and on rock, the displacement grows on."""
+    creep, push = 0.02, 1e-3
+    still = np.zeros(COUNT)
+    slid = {"creep": creep, "damping_time": 0.0}
+    state, _, _ = step(LENGTH / creep, -push + still, still, still, **slid)
+    assert state["slip_x"] == pytest.approx(push / creep * (1.0 - np.exp(-1.0)), rel=1e-9)
+    state, _, _ = step(1e3, -push + still, still, still, **slid)
+    assert state["slip_x"] == pytest.approx(push / creep, rel=1e-9)
+    for more in ({"damping_time": 0.0}, {**slid, "rock": 1.0}):
+        state, _, _ = step(100.0, -push + still, still, still, **more)
+        assert (state["slip_x"] > 5.0 * push / creep).all()
+    # a wheel that rolls faster than that does not feel it
+    rolling = [step(0.01, 0.2 + still, 0.05 + still, 0.25 + still, creep=c)[0] for c in (0.0, creep)]
+    for name in ("slip_x", "slip_y", "direction"):
+        np.testing.assert_array_equal(rolling[0][name], rolling[1][name])
 
 
 def test_nothing_jumps_while_a_wheel_reverses() -> None:

@@ -150,7 +150,7 @@ def pressure_sinkage(c: Context, p: SimpleNamespace) -> None:
 def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """L dk/dt = v_slip - V_r k, exact over a step.
 
-    L is the contact length times `relaxation`, and V_r the larger of |r omega| and |v_x|. The force
+    L is the contact length times `relaxation`, and V_r the largest of |r omega|, |v_x| and, on soil, `creep`. The force
     takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling. On soil the time
     is cut to what an explicit step takes without shaking a wheel at rest.
     """
@@ -162,7 +162,8 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     length = np.where(c.soil["rock"] > 0.5, p.rock_length, p.relaxation * arc)
     roll = faster(contact["rim_speed"], contact["v_x"])
     speed = np.abs(roll)
-    share = speed / length
+    renewing = np.where(c.soil["rock"] > 0.5, speed, np.maximum(speed, p.creep))
+    share = renewing / length
     touching = contact["sinkage"] > 0.0
     # the equation is linear while slip is held, so that its solution over a step holds at any ratio of speed and length
     # Divided by below; in float64 this is zero for all that matters.
@@ -178,7 +179,7 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     damped = damping_time * np.exp(-share * damping_time)
 
     def advance(value: np.ndarray, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rate = gain * (source - speed * value)
+        rate = gain * (source - renewing * value)
         new = value + c.dt * rate
         return new * touching, (new + damped * rate) * touching
 

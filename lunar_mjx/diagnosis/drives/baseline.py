@@ -42,6 +42,10 @@ BASELINE: Mapping[str, Mapping[str, tuple[float, float]]] = {
 }
 """What a refit moves, by effect and parameter: scale as a share of the value, and prior standard deviation in scales:
 how well soil and motor are known before a drive."""
+FROM_NOTHING: Mapping[str, Mapping[str, tuple[float, float, float]]] = {"shear_state": {"creep": (0.01, 5.0, 0.3)}}
+"""Parameters that are nothing in a model as it comes: scale in SI units, prior standard deviation in scales, and step
+of a derivative in scales. (How shear begins as a wheel starts, no law of steady driving tells, and every simulator
+rounds it off somewhere; a wheel crosses a crawl in a few readings, of which no short step tells.)"""
 
 NOT_MISSING = frozenset(
     {
@@ -68,6 +72,9 @@ def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple
     """Baseline parameters; one that differs between wheels or joints moves by a common factor."""
     coordinates = []
     for effect in model.effects:
+        for name, (scale, prior, _) in FROM_NOTHING.get(effect.name, {}).items() if effect.name in baseline else ():
+            p, value = effect.parameters[name], float(model.parameters[effect.name][name])
+            coordinates.append(Coordinate(effect.name, name, value, scale, *p.bounds, prior=prior, unit=p.unit))
         for name, (relative, prior) in baseline.get(effect.name, {}).items():
             value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
             p = effect.parameters[name]

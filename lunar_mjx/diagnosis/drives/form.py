@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from lunar_mjx.diagnosis.drives.baseline import FROM_NOTHING
 from lunar_mjx.diagnosis.drives.channel_errors import ChannelErrors, error_kind
 from lunar_mjx.diagnosis.drives.differences import STEP
 from lunar_mjx.diagnosis.drives.instruments import usual_kind
@@ -150,7 +151,8 @@ class DriveForm(MeasuredForm):
         self._std[self.discrepancy] = math.sqrt(self._share.mean) * self._whole_size
         # (coordinates,) steps of derivatives, in scales. Inputs act on every reading, at all times: to first order in a
         # fiftieth of what is usual a jump of a reading is little, where over a short step it is a slope of thousands.
-        self._steps = np.full(len(self.coordinates), STEP)
+        own = [FROM_NOTHING.get(c.effect, {}).get(c.name, (0.0, 0.0, STEP))[2] for c in self.coordinates]
+        self._steps = np.array(own)
         self._steps[self.discrepancy] = 1e-3 * self._whole_size
         self._seen: np.ndarray | None = None  # (n, coordinates) derivatives at the base, SI
         self._secants: np.ndarray | None = None  # (n, coordinates) changes by a usual amount there, over that amount

@@ -215,16 +215,25 @@ def _remembered_slip(x, contact):
         "rolling distance over which contact on soil renews itself, over the contact length",
         "choice: one contact length brings fresh soil",
     ),
+    creep=Parameter(
+        0.0,
+        None,
+        (0.0, 1.0),
+        "m/s",
+        "speed as that of which contact on soil renews itself at least: sheared soil gives way under a wheel at rest",
+        "choice: none, a wheel at rest stays where it is",
+    ),
 )
 def shear_state(ctx, p, x, wheel):
     """Shear displacement as a state: static friction at standstill, eqs. 8 and 9 when rolling (flaw 4).
 
-    L dk/dt = v_slip - V_r k with V_r = max(|r omega|, |v_x|) and L the contact length times `relaxation` (relaxation
-    length model, Bernard & Clover 1995, SAE 950311): k tends to the slip of eq. 8 while rolling, and keeps the
-    displacement of a wheel that stands. The same for (1 - s) tan(beta) of eq. 11, and for the direction in which the
-    contact leans: that of rim and hub, their sum within V_r where they are opposed. Integrated exactly over a step,
-    hence stable at any speed. The force takes k plus `damping_time` times its rate; on soil for no longer than keeps a
-    wheel at rest from shaking.
+    L dk/dt = v_slip - V_r k with V_r = max(|r omega|, |v_x|, creep) and L the contact length times `relaxation`
+    (relaxation length model, Bernard & Clover 1995, SAE 950311): k tends to the slip of eq. 8 while rolling, and keeps
+    the displacement of a wheel that stands. With `creep` it forgets that in the time L / creep, and what holds a wheel
+    at rest is its slip speed over that speed: many simulators put such a floor under the slip's denominator. The same
+    for (1 - s) tan(beta) of eq. 11, and for the direction in which the contact leans: that of rim and hub, their sum
+    within V_r where they are opposed. Integrated exactly over a step, hence stable at any speed. The force takes k plus
+    `damping_time` times its rate; on soil for no longer than keeps a wheel at rest from shaking.
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
@@ -232,15 +241,16 @@ def shear_state(ctx, p, x, wheel):
     length = jnp.where(rock, p.rock_length, p.relaxation * arc)
     # eq. 8 divides by the faster of rim and hub
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
+    renewing = jnp.maximum(jnp.abs(roll), jnp.where(rock, 0.0, p.creep))
     # share of the way to the steady value, over the time that it would take at the first rate
-    gained = mean_decay(jnp.abs(roll) * ctx.dt / length) / length
+    gained = mean_decay(renewing * ctx.dt / length) / length
     damping_time = jnp.minimum(p.damping_time, _longest_damping_time(ctx, arc, length))
-    held = jnp.exp(-jnp.abs(roll) * damping_time / length)
+    held = jnp.exp(-renewing * damping_time / length)
     lifted = airborne(contact)
 
     def advance(value, speed):
         # (1 - exp(-V dt/L))/(V dt) in place of 1/L: the exact mean rate over the step, finite where V is 0
-        rate = gained * (speed - jnp.abs(roll) * value)
+        rate = gained * (speed - renewing * value)
         new = value + ctx.dt * rate
         # damping acts on soil that is being loaded; it fades with rolling, which brings fresh soil
         return jnp.where(lifted, 0.0, new), jnp.where(lifted, 0.0, new + damping_time * rate * held)

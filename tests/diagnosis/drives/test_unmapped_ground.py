@@ -73,7 +73,16 @@ def test_a_map_is_taken_at_its_word(model):
 def test_choices_of_how_contact_moves_are_fitted():
     for preset, normal in (("consistent", "pressure_sinkage"), ("field", "stress_integral")):
         own = {c.key for c in baseline_coordinates(make_model("luvmi_x", preset=preset), BASELINE)}
-        assert {f"{normal}.damping", "shear_state.damping_time", "shear_state.relaxation"} <= own
+        assert {f"{normal}.damping", *(f"shear_state.{p}" for p in ("damping_time", "relaxation", "creep"))} <= own
+
+
+def test_what_is_nothing_in_a_model_as_it_comes_begins_there():
+    (creep,) = (c for c in baseline_coordinates(make_model("luvmi_x"), BASELINE) if c.name == "creep")
+    assert (creep.value(0.0), creep.bounds()[0], creep.log, creep.unit) == (0.0, 0.0, False, "m/s")
+    fitted = make_model("luvmi_x").set("shear_state", creep=0.03)
+    (creep,) = (c for c in baseline_coordinates(fitted, BASELINE) if c.name == "creep")
+    assert creep.value(0.0) == 0.03 and creep.value(creep.bounds()[0]) == 0.0
+    assert not any(c.name == "creep" for c in baseline_coordinates(fitted, {}))
 
 
 def _at(field: HeightField, heights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
