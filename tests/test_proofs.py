@@ -97,6 +97,7 @@ def test_all_have_no_limit():
     assert [turn.next() for _ in FILES] == FILES and turn.next() is None and math.isinf(turn.until_stop())
 
 
+@pytest.mark.slow
 def test_a_file_is_run_as_a_process_and_stopped_with_its_children(tmp_path, monkeypatch):
     monkeypatch.setattr(proofs, "FOUND", tmp_path / "proofs.json")
     monkeypatch.setattr(proofs, "ROOT", tmp_path)

@@ -21,6 +21,8 @@ from lunar_mjx.agents.train import RunConfig, train
 from lunar_mjx.envs import PointEnv, make_agent, make_navigation, split_keys
 from lunar_mjx.errors import UserError
 
+pytestmark = pytest.mark.slow
+
 ROWS, COLUMNS = 12, 12
 SPREAD = 0.3
 """Width of the spot that shows the goal, m."""

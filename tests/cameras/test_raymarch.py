@@ -44,6 +44,7 @@ def test_sphere_is_exact(march):
     assert seen[30, 40] == pytest.approx(b - np.sqrt(b * b - c), rel=2e-4)
 
 
+@pytest.mark.slow
 def test_batch_and_chunks_agree_with_one(march):
     terrain, small = bumpy(), Pinhole(16, 12)
     poses = [look_at((0.0, 0.3 * i, 1.0 + 0.1 * i), (3.0, 0.0, 0.0)) for i in range(5)]

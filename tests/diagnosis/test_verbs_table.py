@@ -258,6 +258,7 @@ def test_next_names_the_sweep_that_tells_two_effects_apart(run, logs, work):
     assert json.loads((folder / "next.json").read_text()) == answer
 
 
+@pytest.mark.slow
 def test_an_audit_counts_and_goes_on_where_it_was(run, logs, work):
     _asked(run, logs / "null", work / "null")
     first = audit(work / "null", 1e-3)

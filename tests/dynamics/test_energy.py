@@ -77,6 +77,7 @@ def _armature(system) -> np.ndarray:
     return armature
 
 
+@pytest.mark.slow
 def test_a_batch_gives_what_single_rovers_give() -> None:
     """Rovers on different terrains in one batch move as each would alone."""
     b = bench("luvmi_x")

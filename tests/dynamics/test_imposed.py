@@ -50,6 +50,7 @@ def test_straight_drive_costs_friction_alone(drive):
     np.testing.assert_allclose(seen.speed_x[:, -1], [0.3, -0.3], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_rolling_resistance_and_slope_add_up(drive):
     """Within 1 %: gravity stands in the chassis frame, which the drives' reaction tilts by 0.02 deg on its tyres."""
     level = run(drive, [(0.3, 0.3)], rolling_resistance__coefficient=0.05)

@@ -54,6 +54,7 @@ def test_drives_with_soil_agree_with_mjx(rover):
     assert np.abs(ours[1] - theirs[1]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_one_step_agrees_with_mjx_in_float32():
     model = make_model("luvmi_x")
     new = {}

@@ -316,7 +316,8 @@ SMOOTH = {
 }
 
 
-@pytest.mark.parametrize("which", [pytest.param(w, marks=pytest.mark.slow) if "all that" in w else w for w in SMOOTH])
+@pytest.mark.slow
+@pytest.mark.parametrize("which", SMOOTH)
 def test_derivatives_are_finite(which: str) -> None:
     """All forces and heat flows by all parameters and all inputs, forward and reverse, at nominal and null values.
 

@@ -81,6 +81,7 @@ def test_derivatives_at_the_null_are_those_of_a_first_touch(name: str) -> None:
             assert np.abs(numeric - slope).max() < 2e-3 * np.abs(slope).max(), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["null", "nominal"])
 def test_derivatives_by_everything_are_finite(at: str) -> None:
     """All effects together, by all parameters and all motions, forward and reverse."""

@@ -32,6 +32,7 @@ def _units(one):
         return promises._homogeneity(one, ROVERS, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["chassis_node", "motor_power", "housing_radiation", "angle_sinkage"])
 def test_effects_with_constants_of_nature_hold_in_any_units(name: str) -> None:
     assert _units(CATALOGUE[name]).passed

@@ -140,6 +140,7 @@ def test_at_small_depths_depth_and_normal_are_the_true_ones() -> None:
     assert np.abs(left).max() < 2e-3 * 2e-3 / (2.0 * 0.3 / 9.0) * 2.0
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_everywhere() -> None:
     """In contact, apart, with the centre in the wheel's, with the axle upright and downward, and for spheres."""
     d = _random(400, 2.0)

@@ -46,6 +46,7 @@ def test_forces_agree_with_a_bed_of_other_code(bed):
     np.testing.assert_allclose(found.sinkage, other.sinkage, atol=1e-3 * RADIUS)
 
 
+@pytest.mark.slow
 def test_slip_gives_thrust_and_sinkage_and_soil_opposes_the_slip_angle(bed):
     slip = np.array([-0.3, 0.0, 0.3])
     ahead = run(bed, slip, np.zeros(3))

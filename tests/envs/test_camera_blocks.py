@@ -13,6 +13,8 @@ from lunar_mjx.envs import make_navigation, split_keys
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 
+pytestmark = pytest.mark.slow
+
 SIZE = {"camera_width": 16, "camera_height": 12}
 
 

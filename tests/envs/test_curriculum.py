@@ -23,6 +23,7 @@ SMALL = dataclasses.replace(get_rung(3), size=40.0, goal_distance=(8.0, 20.0), d
 LEVELS = 4
 
 
+@pytest.mark.slow
 def test_levels_begin_on_the_shortest_way_and_the_last_one_where_the_rung_does():
     pool, plain = (make_pool(SMALL, 0, 2, 0.4, levels=n) for n in (LEVELS, 0))
     at = pool.places

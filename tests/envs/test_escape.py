@@ -18,7 +18,7 @@ from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.envs.navigation.randomise import Range
 from lunar_mjx.errors import UserError
 
-pytestmark = pytest.mark.optimised
+pytestmark = [pytest.mark.optimised, pytest.mark.slow]
 SMALL = {"task": "escape", "preset": "consistent", "places": 16, "episode_time": 60.0}
 ROVERS = 8
 

@@ -25,6 +25,8 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import nearest_rock
 from tests.envs.independent_planner import Planner, length
 
+pytestmark = pytest.mark.slow
+
 HALF = 0.4
 SMALL = dataclasses.replace(get_rung(3), size=40.0, goal_distance=(8.0, 20.0), detour=1.1)
 

@@ -19,6 +19,8 @@ from lunar_mjx.envs.ladder.renewal import Renewal, begins, pick, with_world, wor
 from lunar_mjx.envs.ladder.rungs import RUNGS, get_rung
 from lunar_mjx.errors import UserError
 
+pytestmark = pytest.mark.slow
+
 SMALL = dataclasses.replace(get_rung(3), size=40.0, goal_distance=(8.0, 20.0), detour=1.1)
 WORLDS, LEVELS, HALF = 4, 4, 0.4
 

@@ -18,6 +18,8 @@ from lunar_mjx.model import make_model
 from lunar_mjx.wheel_bed.particles.settings import Numerics, Sand
 from tests.wheel_bed.particles.spring_bed import SpringBed
 
+pytestmark = pytest.mark.slow
+
 PLAN = """format = "lunar-mjx-manoeuvre/1"
 terrain = "slope:5deg"
 [[segment]]

@@ -12,6 +12,8 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.manoeuvres.cmd_vel import CmdVel, cmd_vel_commands
 from lunar_mjx.model import make_model
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def rocker():

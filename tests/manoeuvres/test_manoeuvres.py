@@ -131,6 +131,7 @@ def test_refused_uses(luvmi: Model) -> None:
         commands(load_manoeuvre("slope"), luvmi, 0.0)
 
 
+@pytest.mark.slow
 def test_the_stand_lifts_the_wheels_and_they_turn_freely(luvmi: Model) -> None:
     plan = load_manoeuvre("wheels_lifted")
     model = with_arrangement(plan, luvmi)

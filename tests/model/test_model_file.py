@@ -94,6 +94,7 @@ def test_a_short_file_is_the_preset(tmp_path: Path) -> None:
     assert_same(load_model(path), make_model("luvmi_x", "flat"))
 
 
+@pytest.mark.slow
 def test_a_loaded_model_runs_to_the_same_numbers(tmp_path: Path) -> None:
     model = varied(tmp_path)["user's effect"].set("soil", cohesion=300.0).replace(gravity=1.7)
     first = build(model, "mjx")

@@ -8,6 +8,7 @@ import pytest
 from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["paper", "consistent"])
 def test_hot_motor_loses_torque_and_cuts_off_at_150_degC(preset: str) -> None:
     """Fig. 3: torque starts at the 15 N m asked for, falls as the winding heats, and drops to zero at 150 degC."""

@@ -137,6 +137,7 @@ def test_a_figure_for_dark_pages_comes_beside_the_light_one(tmp_path):
     assert corners == [PAPER, DARK[PAPER]]
 
 
+@pytest.mark.slow
 def test_the_ground_in_space_stands_on_the_page_itself(monkeypatch):
     monkeypatch.setattr(pictures, "_portrait", lambda *_: (np.zeros((2, 2, 3)), {"title": ""}))
     with styled():

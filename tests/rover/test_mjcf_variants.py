@@ -17,6 +17,8 @@ from lunar_mjx.resources import shipped
 from lunar_mjx.rover import load_rover
 from tests.dynamics.structured_reference import Reference
 
+pytestmark = pytest.mark.slow
+
 ARM, STEER, DRIVE = (f'<joint name="lf_{part}"' for part in ("suspension", "steer", "drive"))
 BODY, KNUCKLE, CHASSIS = '<body name="lf_arm"', '<body name="lf_knuckle"', '<body name="chassis"'
 COMPILER, OPTION, FLAG, MOTOR = "<compiler", "<option", "<flag", '<motor name="lf_drive"'

@@ -21,6 +21,8 @@ from lunar_mjx.model import make_model
 from lunar_mjx.resources import shipped
 from lunar_mjx.rover import convert, load_rover
 
+pytestmark = pytest.mark.slow
+
 SOURCES = ("rocker_bogie.urdf", "rocker_bogie.rover.toml")
 
 

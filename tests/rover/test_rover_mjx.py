@@ -72,6 +72,7 @@ def test_steps_without_nan_in_float32(rover: Rover, drive: tuple[mujoco.MjModel,
     assert qpos[-1, 2] == pytest.approx(rover.standing_height, abs=0.1)
 
 
+@pytest.mark.slow
 def test_accelerations_agree_with_native_mujoco(rover: Rover) -> None:
     """One solve in each engine from the same moving state, with closed loops; float32 against float64."""
     model = rover.compile()

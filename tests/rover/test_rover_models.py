@@ -214,6 +214,7 @@ def test_positive_suspension_lifts_the_chassis_and_keeps_uprights_upright(rover:
             np.testing.assert_allclose(upright.xmat, chassis.xmat, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_loops_stay_closed_under_twenty_seconds_of_drive() -> None:
     rover = load_rover("viper")
     drive = Drive(rover, bump=0.06)

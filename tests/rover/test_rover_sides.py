@@ -38,6 +38,7 @@ def test_a_shared_motor_is_split_evenly():
     np.testing.assert_allclose(armature, np.array(motor["rotor_inertia"]) * 78.71**2)
 
 
+@pytest.mark.slow
 def test_engines_agree_on_tied_wheels():
     """A skid turn with different targets within a side, whose mean the motor drives: both engines agree."""
     model = make_model("husky", "flat").replace(gains={"drive": (0.0, 60.0)})

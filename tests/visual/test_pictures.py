@@ -25,6 +25,7 @@ def decoded(path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
+@pytest.mark.slow
 def test_summary_plot(run, luvmi, tmp_path):
     result = run("plot", luvmi[0], "--out", tmp_path / "summary.png")
     assert result.status == 0 and result.out.strip() == str(tmp_path / "summary.png")

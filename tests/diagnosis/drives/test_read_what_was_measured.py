@@ -150,6 +150,7 @@ def test_a_discrepancy_of_an_unknown_channel_is_refused() -> None:
             with_discrepancy(seen, {name: size})
 
 
+@pytest.mark.slow
 def test_clocks_and_mountings_known_within_an_error(tmp_path: Path, model: Model) -> None:
     late, turn = 0.02, np.radians(0.5)
     speed = {f"command_{c}_drive_speed_rad_s": 1.0 + np.sin(2.0 * TIME) for c in CORNERS}

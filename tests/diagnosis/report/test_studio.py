@@ -86,6 +86,7 @@ def test_no_text_of_a_run_becomes_markup(tmp_path):
     assert "http://" not in page and "https://" not in page
 
 
+@pytest.mark.slow
 def test_the_error_falls_in_an_animation(tmp_path):
     folder = write_run(tmp_path / "run", table=True)
     course = falling._course(3)
