@@ -12,7 +12,7 @@ from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Term, shifted
-from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, search
+from lunar_mjx.inference.weighing.search import ALIKE, Hypothesis, _carried_over, search
 from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, TwoValleys, X, curve, measured
 
 
@@ -187,6 +187,45 @@ def test_something_unlisted_is_unknown_at_its_port():
     tried = set().union(*(h.effects for h in found.hypotheses if h.refitted))
     assert tried == set(EFFECTS), "something unlisted was believed before every effect was refitted"
     assert said.port == "level"
+
+
+@pytest.mark.parametrize("effect", ["square", "wave"])
+def test_what_is_unlisted_is_like_the_effect_that_makes_it(effect):
+    """The other one could do little of it; nor could one that would have to be negative."""
+    form = ToyForm(measured(0, **{effect: 0.6}))
+    linear = form.refit(frozenset(), None, None).linear
+    level = frozenset(t for t in form.terms if t.name == "level")
+    _, found, places = linear.evidence(level)
+    share = linear.alike(found, places, frozenset({"level"}))
+    assert set(share) == set(EFFECTS) and all(0.0 <= v <= 1.0 + 1e-9 for v in share.values())
+    other = "wave" if effect == "square" else "square"
+    assert share[effect] > 0.9 > 0.1 > share[other]
+    against = dataclasses.replace(linear, high=np.where(np.arange(14) == EFFECTS[effect], 0.0, linear.high))
+    assert against.alike(found, places, frozenset({"level"}))[effect] < 1e-9
+    assert set(linear.alike(found, places, frozenset()).values()) == {0.0}
+
+
+def test_what_could_do_most_of_what_is_unlisted_is_asked_before_what_estimates_promise(monkeypatch):
+    asked = []
+
+    class Asked(ToyForm):
+        def refit(self, effects, near, start):
+            asked.append(set(effects))
+            return super().refit(effects, near, start)
+
+    def first(alike):
+        asked.clear()
+        monkeypatch.setattr(Linear, "alike", lambda *_: alike)
+        kink = 0.5 * np.where(X > 0.2, X - 0.2, 0.0) * np.cos(6.0 * X)
+        found = search([Asked(measured(3) + kink)], most_refits=12, most_terms=4, window=4.0)
+        assert conclude(found, 0.95).port == "level"
+        assert set().union(*asked) == set(EFFECTS)
+        return asked[1]
+
+    nothing = dict.fromkeys(EFFECTS, 0.0)
+    usual = first(nothing | {"wave": ALIKE})
+    (other,) = set(EFFECTS) - usual - {sorted(set(EFFECTS) - usual)[0]}
+    assert first(nothing | {other: 0.9}) == {other}
 
 
 def test_a_refit_that_fails_is_no_hypothesis_and_is_told():

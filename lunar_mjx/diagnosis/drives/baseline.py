@@ -73,8 +73,10 @@ def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple
     coordinates = []
     for effect in model.effects:
         for name, (scale, prior, _) in FROM_NOTHING.get(effect.name, {}).items() if effect.name in baseline else ():
-            p, value = effect.parameters[name], float(model.parameters[effect.name][name])
-            coordinates.append(Coordinate(effect.name, name, value, scale, *p.bounds, prior=prior, unit=p.unit))
+            p, value = effect.parameters[name], np.asarray(model.parameters[effect.name][name], float)
+            if value.ndim == 0:
+                own = Coordinate(effect.name, name, float(value), scale, *p.bounds, prior=prior, unit=p.unit)
+                coordinates.append(own)
         for name, (relative, prior) in baseline.get(effect.name, {}).items():
             value = np.atleast_1d(np.asarray(model.parameters[effect.name][name], float))
             p = effect.parameters[name]

@@ -32,10 +32,13 @@ WORDS: Mapping[str, str] = {
 }
 """Fields of discrepancy, and what is "good to so many per cent" in the user's words."""
 
-ADDED, DRAWN, CRAWLING = 0.25, 0.1, 15.0
+ADDED, DRAWN, CRAWLING, DRIVEN = 0.25, 0.1, 15.0, 0.2
 """Sizes over that of the field: of a force that is added, over the load; of the wheel's deformation, over its radius
-(as for tables); of the shear of wheels that hardly move, of which no more than the order is known."""
+(as for tables); of the shear of wheels that hardly move, of which no more than the order is known; of a motor's current
+and of the torque at its joint, whose laws are known better than any soil's."""
 SHARES: Mapping[str, float] = {
+    "command: motor current": DRIVEN,
+    "motor_torque": DRIVEN,
     "geometry: wheel radius": DRAWN,
     "wheel_normal: resistance": ADDED,
     "wheel_shear: longitudinal force": ADDED,

@@ -200,6 +200,39 @@ class Linear:
             shown_sigma[name] = float(np.sqrt(max(length.max(), 0.0))) if len(places) else 0.0
         return shown_sigma
 
+    def alike(self, found: Evidence, places: np.ndarray, unlisted: frozenset[str]) -> dict[str, float]:
+        """Share of what something unlisted was found to do that each effect could do in its place, from 0 to 1.
+
+        What the form's own parameters could do counts for neither.
+
+        Args:
+          found, places: what `evidence` gave for a set with these terms. unlisted: names of the terms.
+
+        Returns:
+          By effect; squares of lengths in the fitted measurements, at the noise found, count.
+        """
+        numbers = [k for k, f in enumerate(self.fields) if f.name in unlisted]
+        more = [p for part in (self.added, self.following) for name, p in part.items() if name in unlisted]
+        own = np.isin(self.amplitudes.field[places], numbers) | np.isin(places, np.concatenate([np.zeros(0), *more]))
+        # from nothing, not from the refit, which may have moved some of it
+        amounts = np.zeros(self.gram.width)
+        amounts[places[own]] = found.mean[own] - self.amplitudes.mean[places[own]]
+        whole = np.einsum("g,gij->ij", found.noise**-2.0, self.gram.matrix)[:-1, :-1]
+        # What the form's own parameters can do is left out of both: either could have it.
+        form = self.always[self.amplitudes.field[self.always] < 0]
+        scale = self.amplitudes.std[form]
+        inner = np.eye(len(form)) + scale[:, None] * whole[np.ix_(form, form)] * scale
+        absorbed = scale[:, None] * whole[form]
+        whole = whole - absorbed.T @ np.linalg.solve(inner, absorbed)
+        seen = whole @ amounts
+        length = float(amounts @ seen)
+        shares = {}
+        for name, p in self.effects.items():
+            inner = whole[np.ix_(p, p)]
+            x = np.clip(np.linalg.pinv(inner, hermitian=True) @ seen[p], self.low[p], self.high[p])
+            shares[name] = max(float(2.0 * x @ seen[p] - x @ inner @ x), 0.0) / length if length > 0.0 else 0.0
+        return shares
+
     def felt(self) -> dict[str, float]:
         """Length in sigma of each field's strongest direction at the size of something unlisted; 0 for none."""
         whole = np.diag(self.gram.matrix.sum(axis=0))[:-1]

@@ -10,7 +10,9 @@ What an effect promises is believed in the share that its refits have kept. Else
 always more than refits, would stand in front of those that were refitted by a promise that has been broken already.
 
 Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts: where a
-signature saturates, the linear estimate at its null is much too low.
+signature saturates, the linear estimate at its null is much too low. First, and before any set that a linear estimate
+promises, come those that could do most of what is unlisted: about a refit without it, an effect that its parameters
+and its unlisted inputs have stood in for promises nothing.
 """
 
 from __future__ import annotations
@@ -30,6 +32,9 @@ Terms = frozenset[Term]
 LEAST_SIGNAL = 1.0
 """Length in sigma of a signature at its prior size below which no data can speak for or against an effect or an
 unlisted input: it is undecidable, and keeps its prior probability without being listed."""
+ALIKE = 0.5
+"""1; share of what something unlisted does from which an effect that could do it is refitted before all others: more
+of it than not."""
 UNLISTED_SHARE = 0.5
 """Probability of something unlisted from which every effect that could be seen is refitted from where it acts: more
 probable than not."""
@@ -236,6 +241,11 @@ class _Search:
             self.refit(by_name[leads.form], doubtful[0], leads)
             provisional(self.ranked(False))
             return True
+        alike = self.alike(leads)
+        if alike:
+            self.refit(by_name[leads.form], leads.effects | {alike[0]}, leads, alike[0])
+            provisional(self.ranked(False))
+            return True
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
         open_ = [h for h in near if (h.form, h.effects) not in self.done]
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
@@ -373,19 +383,43 @@ class _Search:
         Empty where something unlisted is less probable than its share: then what is listed explains the measurements.
         Empty, too, where one effect more would be too many.
         """
-        if len(best.effects) >= self.most_terms:
+        if not self.may_be_unlisted(best):
             return []
-        scored = list(self.known.values())
-        top = max(h.log_posterior for h in scored)
-        weights = [(math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in scored]
-        # refits of everything are dear: they are made only where something unlisted would else be believed
-        if sum(w for w, other in weights if other) < self.unlisted_share * sum(w for w, _ in weights):
-            return []
+        scored = self.known.values()
         linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
+        return sorted(self.not_refitted(best), key=lambda n: -linear.get(n, -math.inf))
+
+    def alike(self, leads: Hypothesis) -> list[str]:
+        """Effects that no refit has tried beside a refitted set and that could do most of what is unlisted there, the
+        one most like it first; empty as for `untried`."""
+        unlisted = [
+            h
+            for h in self.known.values()
+            if h.refit is leads.refit and h.effects == leads.effects and any(t.kind == UNLISTED for t in h.terms)
+        ]
+        if not unlisted or not self.may_be_unlisted(leads):
+            return []
+        most = max(unlisted, key=lambda h: h.log_posterior)
+        names = frozenset(t.name for t in most.terms if t.kind == UNLISTED)
+        share = leads.refit.linear.alike(most.evidence, most.places, names)
+        return sorted((n for n in self.not_refitted(leads) if share[n] > ALIKE), key=lambda n: -share[n])
+
+    def may_be_unlisted(self, best: Hypothesis) -> bool:
+        """Whether something unlisted would be believed by what is known, and one effect more is not too many."""
+        if len(best.effects) >= self.most_terms:
+            return False
+        top = max(h.log_posterior for h in self.known.values())
+        weights = [
+            (math.exp(h.log_posterior - top), any(t.kind == UNLISTED for t in h.terms)) for h in self.known.values()
+        ]
+        # refits of everything are dear: they are made only where something unlisted would else be believed
+        return sum(w for w, other in weights if other) >= self.unlisted_share * sum(w for w, _ in weights)
+
+    def not_refitted(self, best: Hypothesis) -> list[str]:
+        """Effects that could be seen and that no refit has tried beside a set."""
         shows = best.refit.linear.shows()
         names = [n for n in shows if n not in best.effects and shows[n] >= self.least_signal]
-        names = [n for n in names if (best.form, best.effects | {n}) not in self.done]
-        return sorted(names, key=lambda n: -linear.get(n, -math.inf))
+        return [n for n in names if (best.form, best.effects | {n}) not in self.done]
 
     def score_around(self, form: Form, made: Refit, near: Hypothesis | None) -> bool:
         """Scores the refitted set with every choice of terms that need no refit, and their neighbours by one effect.
