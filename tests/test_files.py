@@ -121,7 +121,6 @@ LONG_TO_MAKE = [n for n in OUTPUTS if Path(n).suffix in (".png", ".svg", ".gif",
 """A tenth of a second each: every fifth size in each run, the others in the slow proofs."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [PARQUET if n == "drive.parquet" else n for n in OUTPUTS])
 def test_a_disk_that_is_full_keeps_the_old_file(name, tmp_path):
     _full_disk(name, tmp_path, 5 if name in LONG_TO_MAKE else 1)

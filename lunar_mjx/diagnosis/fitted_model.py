@@ -33,7 +33,8 @@ def fitted_model(
         c = coordinates[i]
         if c.nuisance or c.effect not in model.effect_names or c.name in (held or {}):
             continue
-        value = float(c.value(u[i]))
+        # at a bound rounding may lie beyond it
+        value = min(max(float(c.value(u[i])), c.low), c.high)
         old = model.parameters[c.effect][c.name]
         # A factor keeps the differences between wheels that the model holds; a plain value is one for all of them.
         if c.factor:

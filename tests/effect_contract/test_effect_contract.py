@@ -316,8 +316,7 @@ SMOOTH = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("which", SMOOTH)
+@pytest.mark.parametrize("which", [w if w == "consistent" else pytest.param(w, marks=pytest.mark.slow) for w in SMOOTH])
 def test_derivatives_are_finite(which: str) -> None:
     """All forces and heat flows by all parameters and all inputs, forward and reverse, at nominal and null values.
 

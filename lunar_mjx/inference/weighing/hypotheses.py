@@ -200,30 +200,24 @@ class Linear:
             shown_sigma[name] = float(np.sqrt(max(length.max(), 0.0))) if len(places) else 0.0
         return shown_sigma
 
-    def alike(self, found: Evidence, places: np.ndarray, unlisted: frozenset[str]) -> dict[str, float]:
+    def alike(self, found: Evidence, places: np.ndarray, unlisted: str) -> dict[str, float]:
         """Share of what something unlisted was found to do that each effect could do in its place, from 0 to 1.
 
-        What the form's own parameters could do counts for neither.
+        As it is, not beside what the form's parameters could do: of that the effect's own estimate tells.
 
         Args:
-          found, places: what `evidence` gave for a set with these terms. unlisted: names of the terms.
+          found, places: what `evidence` gave for a set with that term. unlisted: its name.
 
         Returns:
           By effect; squares of lengths in the fitted measurements, at the noise found, count.
         """
-        numbers = [k for k, f in enumerate(self.fields) if f.name in unlisted]
-        more = [p for part in (self.added, self.following) for name, p in part.items() if name in unlisted]
+        numbers = [k for k, f in enumerate(self.fields) if f.name == unlisted]
+        more = [part[unlisted] for part in (self.added, self.following) if unlisted in part]
         own = np.isin(self.amplitudes.field[places], numbers) | np.isin(places, np.concatenate([np.zeros(0), *more]))
         # from nothing, not from the refit, which may have moved some of it
         amounts = np.zeros(self.gram.width)
         amounts[places[own]] = found.mean[own] - self.amplitudes.mean[places[own]]
         whole = np.einsum("g,gij->ij", found.noise**-2.0, self.gram.matrix)[:-1, :-1]
-        # What the form's own parameters can do is left out of both: either could have it.
-        form = self.always[self.amplitudes.field[self.always] < 0]
-        scale = self.amplitudes.std[form]
-        inner = np.eye(len(form)) + scale[:, None] * whole[np.ix_(form, form)] * scale
-        absorbed = scale[:, None] * whole[form]
-        whole = whole - absorbed.T @ np.linalg.solve(inner, absorbed)
         seen = whole @ amounts
         length = float(amounts @ seen)
         shares = {}

@@ -11,8 +11,8 @@ always more than refits, would stand in front of those that were refitted by a p
 
 Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts: where a
 signature saturates, the linear estimate at its null is much too low. First, and before any set that a linear estimate
-promises, come those that could do most of what is unlisted: about a refit without it, an effect that its parameters
-and its unlisted inputs have stood in for promises nothing.
+promises, come those most like what is unlisted: about a refit without it, an effect that parameters and unlisted inputs
+have stood in for promises nothing.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ Terms = frozenset[Term]
 LEAST_SIGNAL = 1.0
 """Length in sigma of a signature at its prior size below which no data can speak for or against an effect or an
 unlisted input: it is undecidable, and keeps its prior probability without being listed."""
-ALIKE = 0.5
-"""1; share of what something unlisted does from which an effect that could do it is refitted before all others: more
-of it than not."""
+FIRST_ALIKE = 2
+"""Effects most like what is unlisted that are refitted beside one set before what else is promised: several are alike
+at one port."""
 UNLISTED_SHARE = 0.5
 """Probability of something unlisted from which every effect that could be seen is refitted from where it acts: more
 probable than not."""
@@ -182,6 +182,7 @@ class _Search:
       record: nats that refits of each effect beside a form have been promised, and how many of these they kept.
       asked: form and effects of sets beside which a doubted effect was refitted.
       over: whether time was up within a refit.
+      looked_alike: number of effects asked for as most like what is unlisted beside a set, by form and effects.
     """
 
     forms: Sequence[Form]
@@ -200,6 +201,7 @@ class _Search:
     record: dict[tuple[str, str], tuple[float, float]] = dataclasses.field(default_factory=dict)
     asked: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
     over: bool = False
+    looked_alike: dict[tuple[str, frozenset[str]], int] = dataclasses.field(default_factory=dict)
 
     @property
     def may_refit(self) -> bool:
@@ -243,7 +245,14 @@ class _Search:
             return True
         alike = self.alike(leads)
         if alike:
-            self.refit(by_name[leads.form], leads.effects | {alike[0]}, leads, alike[0])
+            self.looked_alike[leads.form, leads.effects] = self.looked_alike.get((leads.form, leads.effects), 0) + 1
+            wanted = leads.effects | {alike[0]}
+            near = self.known.get((leads.form, by_name[leads.form].listed(wanted)))
+            # An estimate that promises something is a better start than a place where the effect just acts.
+            if near is not None and near.promise is not None and near.promise.gain > 0.0:
+                self.refit(by_name[leads.form], wanted, near)
+            else:
+                self.refit(by_name[leads.form], wanted, leads, alike[0])
             provisional(self.ranked(False))
             return True
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
@@ -390,19 +399,24 @@ class _Search:
         return sorted(self.not_refitted(best), key=lambda n: -linear.get(n, -math.inf))
 
     def alike(self, leads: Hypothesis) -> list[str]:
-        """Effects that no refit has tried beside a refitted set and that could do most of what is unlisted there, the
-        one most like it first; empty as for `untried`."""
+        """Effects that no refit has tried beside a refitted set, the one most like what is unlisted there first.
+
+        Empty as for `untried`, and where `FIRST_ALIKE` have been asked for.
+        """
         unlisted = [
             h
             for h in self.known.values()
-            if h.refit is leads.refit and h.effects == leads.effects and any(t.kind == UNLISTED for t in h.terms)
+            if h.form == leads.form and h.effects == leads.effects and any(t.kind == UNLISTED for t in h.terms)
         ]
-        if not unlisted or not self.may_be_unlisted(leads):
+        enough = self.looked_alike.get((leads.form, leads.effects), 0) >= FIRST_ALIKE
+        if enough or not unlisted or not self.may_be_unlisted(leads):
             return []
         most = max(unlisted, key=lambda h: h.log_posterior)
-        names = frozenset(t.name for t in most.terms if t.kind == UNLISTED)
-        share = leads.refit.linear.alike(most.evidence, most.places, names)
-        return sorted((n for n in self.not_refitted(leads) if share[n] > ALIKE), key=lambda n: -share[n])
+        names = [t.name for t in most.terms if t.kind == UNLISTED]
+        linear = most.refit.linear
+        shares = [linear.alike(most.evidence, most.places, name) for name in names]
+        share = {n: max(s[n] for s in shares) for n in self.not_refitted(leads)}
+        return sorted((n for n in share if share[n] > 0.0), key=lambda n: -share[n])
 
     def may_be_unlisted(self, best: Hypothesis) -> bool:
         """Whether something unlisted would be believed by what is known, and one effect more is not too many."""

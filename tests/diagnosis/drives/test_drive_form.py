@@ -20,7 +20,7 @@ from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
 from lunar_mjx.diagnosis.drives.observations import observations_of
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
-from lunar_mjx.diagnosis.unknown_inputs.port_fields import Usual, rotation
+from lunar_mjx.diagnosis.unknown_inputs.port_fields import DRIVEN, Usual, rotation
 from lunar_mjx.diagnosis.verbs import explain
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
@@ -405,9 +405,9 @@ def test_columns_are_turned_so_that_few_are_left():
 
 
 def test_fields_are_relative_to_what_is_usual():
-    assert USUAL.size("command: motor current", "current") == pytest.approx(1.0)  # a gain
-    assert USUAL.size("motor_torque", "direction") == pytest.approx(0.4)
-    assert USUAL.size("motor_torque", "squared joint speed") == pytest.approx(0.4 * 4.0 / 2.0**2)
+    assert USUAL.size("command: motor current", "current") == pytest.approx(DRIVEN)  # a fifth of a gain
+    assert USUAL.size("motor_torque", "direction") == pytest.approx(DRIVEN * 0.4)
+    assert USUAL.size("motor_torque", "squared joint speed") == pytest.approx(DRIVEN * 0.4 * 4.0 / 2.0**2)
     assert USUAL.size("soil: stiffness", "slip") == pytest.approx(1.0)
 
 

@@ -16,6 +16,7 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.simulation import log_run
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import POSE as POSE_CHANNELS
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UNMAPPED_GRID, unmapped_ground
+from lunar_mjx.diagnosis.fitted_model import fitted_model
 from lunar_mjx.logs import read_campaign
 from lunar_mjx.manoeuvres.manoeuvre import wheel_places
 from lunar_mjx.model import make_model
@@ -83,6 +84,15 @@ def test_what_is_nothing_in_a_model_as_it_comes_begins_there():
     (creep,) = (c for c in baseline_coordinates(fitted, BASELINE) if c.name == "creep")
     assert creep.value(0.0) == 0.03 and creep.value(creep.bounds()[0]) == 0.0
     assert not any(c.name == "creep" for c in baseline_coordinates(fitted, {}))
+
+
+def test_a_fit_that_ends_at_a_bound_is_a_model_all_the_same():
+    """Down from 0.0034039 m/s the bound of zero comes out as -4e-19."""
+    begun = make_model("luvmi_x").set("shear_state", creep=0.0034039)
+    (creep,) = (c for c in baseline_coordinates(begun, BASELINE) if c.name == "creep")
+    at = creep.bounds()[0]
+    assert creep.value(at) < 0.0
+    assert fitted_model([creep], np.array([at]), [0], begun).parameters["shear_state"]["creep"] == 0.0
 
 
 def _at(field: HeightField, heights: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
