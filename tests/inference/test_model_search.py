@@ -191,7 +191,7 @@ def test_something_unlisted_is_unknown_at_its_port():
 
 @pytest.mark.parametrize("effect", ["square", "wave"])
 def test_what_is_unlisted_is_like_the_effect_that_makes_it(effect):
-    """The other one could do little of it; nor could one that would have to be negative."""
+    """An effect of another shape could do little of it, and one that would have to be negative could do nothing."""
     form = ToyForm(measured(0, **{effect: 0.6}))
     linear = form.refit(frozenset(), None, None).linear
     level = frozenset(t for t in form.terms if t.name == "level")

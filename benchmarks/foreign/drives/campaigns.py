@@ -49,19 +49,18 @@ def jobs(which: str, seed: int, count: int) -> list[Job]:
     return [(which, seed, n, group, hidden, rover) for n, (group, hidden, rover) in enumerate(plan)]
 
 
-def make(job: Job, folder: Path) -> None:
-    """Draws and drives a campaign, and writes its logs and sealed truth as `make` does; nothing where it is there."""
+def make(job: Job, folder: Path) -> dict[str, Any] | None:
+    """The sealed truth of a campaign that was drawn, driven and written to a folder; None where it is there already."""
     case = cases.draw(*job)
     sealed = folder / "truth" / f"{case.name}.json"
     if sealed.is_file():
-        return
+        return None
     found, stands_out = make_told(case)
     cases.write(case, found, folder / "logs" / case.name)
     truth = cases.summary(case) | {"separable": stands_out, "twins": []}
     sealed.parent.mkdir(parents=True, exist_ok=True)
     sealed.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
-    sigma = ", ".join(f"{k} {v['sigma']:.0f} sigma" for k, v in stands_out.items()) or "nothing hidden"
-    print(f"{case.name}  {case.group:<8} {case.rover.name:<8} {case.world.law:<9} {sigma}", flush=True)
+    return truth
 
 
 def make_all(args: argparse.Namespace) -> None:
@@ -69,7 +68,10 @@ def make_all(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     seed = int(campaign(args.out, args.set, args.seed)["seed"])
     for job in jobs(args.set, seed, args.drives):
-        make(job, args.out)
+        if truth := make(job, args.out):
+            sigma = ", ".join(f"{k} {v['sigma']:.0f} sigma" for k, v in truth["separable"].items())
+            about = f"{job[3]:<8} {job[5]:<8} {truth['law']:<9}"
+            print(f"{_name(job)}  {about} {sigma or 'nothing hidden'}", flush=True)
 
 
 def tell(args: argparse.Namespace) -> None:

@@ -45,7 +45,8 @@ how well soil and motor are known before a drive."""
 FROM_NOTHING: Mapping[str, Mapping[str, tuple[float, float, float]]] = {"shear_state": {"creep": (0.01, 5.0, 0.3)}}
 """Parameters that are nothing in a model as it comes: scale in SI units, prior standard deviation in scales, and step
 of a derivative in scales. (How shear begins as a wheel starts, no law of steady driving tells, and every simulator
-rounds it off somewhere; a wheel crosses a crawl in a few readings, of which no short step tells.)"""
+rounds it off somewhere, at a few centimetres a second by choice; a wheel crosses a crawl in a few readings, of which no
+short step tells.)"""
 
 NOT_MISSING = frozenset(
     {

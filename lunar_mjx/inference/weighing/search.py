@@ -246,13 +246,13 @@ class _Search:
         alike = self.alike(leads)
         if alike:
             self.looked_alike[leads.form, leads.effects] = self.looked_alike.get((leads.form, leads.effects), 0) + 1
-            wanted = leads.effects | {alike[0]}
-            near = self.known.get((leads.form, by_name[leads.form].listed(wanted)))
+            form, wanted = by_name[leads.form], leads.effects | {alike[0]}
+            estimate = self.known.get((form.name, form.listed(wanted)))
             # An estimate that promises something is a better start than a place where the effect just acts.
-            if near is not None and near.promise is not None and near.promise.gain > 0.0:
-                self.refit(by_name[leads.form], wanted, near)
+            if estimate is not None and estimate.promise is not None and estimate.promise.gain > 0.0:
+                self.refit(form, wanted, estimate)
             else:
-                self.refit(by_name[leads.form], wanted, leads, alike[0])
+                self.refit(form, wanted, leads, alike[0])
             provisional(self.ranked(False))
             return True
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
