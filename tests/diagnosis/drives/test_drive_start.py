@@ -49,3 +49,12 @@ def test_a_trial_begins_where_its_effect_acts(monkeypatch):
     form.refit(frozenset({"drag"}), base, start.copy())
     assert begun[0] == 0.5 * form.effect_size(form.coordinates[2])
     assert 0.0 in begun
+
+
+def test_what_is_nothing_in_a_model_begins_where_it_acts(monkeypatch):
+    """At zero it has no slope, and a descent would leave it there."""
+    monkeypatch.setattr(module, "FROM_NOTHING", {"base": {"b": (0.01, 5.0, 0.3)}})
+    toy = Toy({"a": 0.8})
+    assert toy.coordinates[1].start == 0.0
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    assert form.start.tolist() == [0.0, 0.5 * toy.coordinates[1].prior] + [0.0] * (len(toy.coordinates) - 2)
