@@ -24,20 +24,21 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import multiprocessing
 import os
 import time
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import harness
 import pandas
-from harness import EXPERIMENTS, KEPT, Clock, Setup, ends, last_policies, save, say, training_of
+from harness import EXPERIMENTS, FINAL, KEPT, Clock, Setup, in_time, save, say, show, training_of
 
 from lunar_mjx.agents.configs import override
-from lunar_mjx.agents.evaluate import success_text
-from lunar_mjx.agents.train import RunConfig, train
+from lunar_mjx.agents.evaluate import Judge
+from lunar_mjx.agents.train import RunConfig
 from lunar_mjx.envs import NavigationEnv, make
 from lunar_mjx.envs.navigation.config import SOIL_RANGES
 from lunar_mjx.envs.navigation.worlds import PREFIX, world
@@ -57,6 +58,35 @@ MAIN = "signed"
 """Of the variants of the paper's task, the one that its record begins with."""
 JUDGED_EVERY, JUDGED, JUDGED_SEED = 2500, 24, 99
 """Steps between scores of the policy without noise, their episodes, and the seed of these."""
+
+
+def last_policies(
+    arms: Mapping[str, tuple[Setup, Any]],
+    tests: Mapping[str, tuple[Judge, Any]],
+    clock: Clock,
+    args: argparse.Namespace,
+) -> Iterator[dict[str, Any]]:
+    """Trains every arm from every seed, one after another while there is time, and scores last policies in every test.
+
+    Args:
+      arms: a compiled setup, and the parameters of the environment to train on, of the shapes of the setup's own;
+        those of `args.only` where that is told.
+      tests: a judge, and the parameters that it scores on.
+
+    Yields:
+      A row with the arm, seed, steps, s, return in training, and scores by test.
+    """
+    names = [name for name in arms if args.only is None or name in args.only]
+    for seed, name in in_time(clock, [(seed, name) for seed in args.seeds for name in names]):
+        setup, params = arms[name]
+        setup.env.params = params
+        result = setup.train(RunConfig(int(args.steps), seed, None, math.inf, quiet=True))
+        policy, last = setup.policy(result.state), result.rows[-1]
+        scores = {test: judge(where, policy, FINAL)["policy"] for test, (judge, where) in tests.items()}
+        say(f"seed {seed}, trained {name}, {last['elapsed_s']:.0f} s; tested")
+        show(scores)
+        about = {"seed": seed, "arm": name, "steps": last["steps"], "train_s": last["elapsed_s"]}
+        yield {**about, "episode_return": last.get("episode_return"), "scores": scores}
 
 
 def plainer(model: Any) -> Any:
@@ -80,8 +110,6 @@ def realism(args: argparse.Namespace, clock: Clock) -> None:
     for row in last_policies(arms, {n: (judge, setups[n].unseen) for n, judge in judges.items()}, clock, args):
         record["seeds"].append({"trained": row.pop("arm"), **row})
         save(args.out, "realism", record)
-        for tested, score in row["scores"].items():
-            say(f"seed {row['seed']} trained {record['seeds'][-1]['trained']}, tested {tested}: {success_text(score)}")
 
 
 def hidden(model: Model) -> Model:
@@ -142,9 +170,8 @@ def posterior(args: argparse.Namespace, clock: Clock) -> None:
     about |= {"episodes": args.episodes, "compile_s": compile_s}
     rows: list[dict[str, Any]] = []
     for row in last_policies(arms, {"hidden": (judge, test)}, clock, args):
-        rows.append({**row, "score": (score := row.pop("scores")["hidden"])})
+        rows.append({**row, "score": row.pop("scores")["hidden"]})
         save(args.out, "posterior", {**about, "runs": rows, "summary": summary(rows)})
-        say(f"seed {row['seed']}, {row['arm']}: {row['train_s']:.0f} s, {success_text(score)}, {ends(score)}")
 
 
 def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -166,20 +193,13 @@ def mean(values: pandas.Series) -> dict[str, Any]:
     return {"mean": float(values.mean()), "error": error, "seeds": len(values)}
 
 
-def about(variant: str) -> dict[str, Any]:
-    """Options of a variant's environment, with those of the variant that it is like, and settings of its trainings."""
-    found = VARIANTS[variant]
-    like = VARIANTS[found["like"]]["options"] if "like" in found else {}
-    return {"options": {**like, **found.get("options", {})}, "settings": found.get("settings", {})}
-
-
 def run(args: argparse.Namespace, core: int, variant: str, name: str, seed: int, seconds: float) -> dict[str, Any]:
     """One training on the paper's task, on a core: its settings, every episode, and the successes of its policy without
     noise."""
     harness.alone_on(core)
-    clock, told = Clock(seconds), about(variant)
-    training = override(training_of(args, name), epoch_steps=250, **told["settings"])
-    setup = Setup(dataclasses.replace(training, options={**training.options, **told["options"]}))
+    clock = Clock(seconds)
+    training = override(training_of(args, name), epoch_steps=250, **VARIANTS[variant].get("settings", {}))
+    setup = Setup(dataclasses.replace(training, options={**training.options, **VARIANTS[variant]["options"]}))
     judge = setup.judge(JUDGED)
     quiet: dict[str, list[float]] = {"step": [], "success": []}
 
@@ -189,8 +209,7 @@ def run(args: argparse.Namespace, core: int, variant: str, name: str, seed: int,
             quiet["success"].append(judge(setup.env.params, setup.policy(state), JUDGED_SEED)["policy"]["success"])
         return {"stop": clock.left < 0.0}
 
-    config = RunConfig(int(args.steps or training.steps), seed, quiet=True)
-    result = train(setup.learner, config, None, None, after_epoch)
+    result = setup.train(RunConfig(int(args.steps or training.steps), seed, quiet=True), after_epoch)
     episodes = {k: result.episodes[k] for k in ("episode_return", "success")}
     taken = {"steps": result.rows[-1]["steps"], "elapsed_s": clock.spent}
     return {"train": setup.about["train"], "run": {"seed": seed, **taken, "episodes": episodes, "without_noise": quiet}}
@@ -208,7 +227,7 @@ def paper(args: argparse.Namespace, clock: Clock) -> None:
     jobs = jobs[: max(2, len(cores))]
     say(f"paper: {len(jobs)} runs of {clock.left:.0f} s on CPU cores")
     settings: dict[str, Any] = {}
-    found: dict[str, Any] = {MAIN: {**about(MAIN), "runs": {}}}
+    told = {v: {k: VARIANTS[v].get(k, {}) for k in ("options", "settings")} | {"runs": {}} for v in (MAIN, *args.only)}
     # compiling, before which a run looks at no clock, has a minute more
     deadline = time.monotonic() + clock.left + 60.0
     with multiprocessing.get_context("spawn").Pool(len(jobs), maxtasksperchild=1) as pool:
@@ -221,5 +240,6 @@ def paper(args: argparse.Namespace, clock: Clock) -> None:
                 continue
             if variant == MAIN:
                 settings[name] = one["train"]
-            found.setdefault(variant, {**about(variant), "runs": {}})["runs"].setdefault(name, []).append(one["run"])
-    save(args.out, "paper", {"variant": MAIN, **found.pop(MAIN), "train": settings, "others": found})
+            told[variant]["runs"].setdefault(name, []).append(one["run"])
+    main, others = told.pop(MAIN), {variant: found for variant, found in told.items() if found["runs"]}
+    save(args.out, "paper", {"variant": MAIN, **main, "train": settings, "others": others})

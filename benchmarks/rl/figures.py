@@ -29,10 +29,12 @@ CURVES = ("rows", "epochs", "unseen", "scores", "episodes")
 
 
 def variants(record: dict[str, Any]) -> dict[str, dict[str, list[dict[str, Any]]]]:
-    """Runs on the paper's own task by variant and algorithm, the main variant first."""
+    """Runs on the paper's own task by variant and algorithm, the main variant first if it was run."""
     found = {record["variant"]: record["runs"], **{v: other["runs"] for v, other in record["others"].items()}}
     return {
-        v: {n.removeprefix("paper-").upper(): runs for n, runs in groups.items() if runs} for v, groups in found.items()
+        v: {n.removeprefix("paper-").upper(): runs for n, runs in groups.items()}
+        for v, groups in found.items()
+        if groups
     }
 
 

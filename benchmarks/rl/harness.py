@@ -6,7 +6,6 @@ import argparse
 import dataclasses
 import functools
 import json
-import math
 import os
 import subprocess
 import sys
@@ -23,10 +22,10 @@ import mujoco
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks.provenance import commit, tree
 from lunar_mjx.agents.configs import Training, get_training, override
-from lunar_mjx.agents.evaluate import Judge
+from lunar_mjx.agents.evaluate import Judge, success_text
 from lunar_mjx.agents.learner import Learner
 from lunar_mjx.agents.run import environment_of, learner_agent, unseen_params
-from lunar_mjx.agents.train import RunConfig, plain, train
+from lunar_mjx.agents.train import Callback, Result, RunConfig, plain, train
 from lunar_mjx.commands.train import env_options, pairs
 from lunar_mjx.envs import make
 from lunar_mjx.files import write_text
@@ -123,6 +122,13 @@ def ends(score: Mapping[str, Any]) -> dict[str, float]:
     return {k: round(v, 3) for k, v in score["ends"].items() if v}
 
 
+def show(scores: Mapping[str, Mapping[str, Any]]) -> None:
+    """Prints a line for every score, by its name."""
+    for name, score in scores.items():
+        costs = "" if score["spl"] is None else f"SPL {score['spl']:.2f}, {score['collisions_per_km']:.0f}/km, "
+        say(f"    {name}: {success_text(score)}, {costs}{ends(score)}")
+
+
 def when(row: Mapping[str, Any]) -> dict[str, Any]:
     """Environment steps and s of training of an epoch's row."""
     return {k: row[k] for k in ("steps", "elapsed_s")}
@@ -181,33 +187,10 @@ class Setup:
 
         return in_threads(self.learner.compile, prepare)
 
+    def train(self, config: RunConfig, after_epoch: Callback | None = None) -> Result:
+        """Trains without a folder; `after_epoch` is called as `lunar_mjx.agents.train.train` calls it."""
+        return train(self.learner, config, None, self.environment, after_epoch)
+
     def policy(self, state: Any) -> Any:
         """The policy of a training's state, on the host."""
         return jax.device_get(self.learner.policy(state))
-
-
-def last_policies(
-    arms: Mapping[str, tuple[Setup, Any]],
-    tests: Mapping[str, tuple[Judge, Any]],
-    clock: Clock,
-    args: argparse.Namespace,
-) -> Iterator[dict[str, Any]]:
-    """Trains every arm from every seed, one after another while there is time, and scores last policies in every test.
-
-    Args:
-      arms: a compiled setup, and the parameters of the environment to train on, of the shapes of the setup's own;
-        those of `args.only` where that is told.
-      tests: a judge, and the parameters that it scores on.
-
-    Yields:
-      A row with the arm, seed, steps, s, return in training, and scores by test.
-    """
-    names = [name for name in arms if args.only is None or name in args.only]
-    for seed, name in in_time(clock, [(seed, name) for seed in args.seeds for name in names]):
-        setup, params = arms[name]
-        setup.env.params = params
-        result = train(setup.learner, RunConfig(int(args.steps), seed, None, math.inf, quiet=True))
-        policy, last = setup.policy(result.state), result.rows[-1]
-        scores = {test: judge(where, policy, FINAL)["policy"] for test, (judge, where) in tests.items()}
-        about = {"seed": seed, "arm": name, "steps": last["steps"], "train_s": last["elapsed_s"]}
-        yield {**about, "episode_return": last.get("episode_return"), "scores": scores}

@@ -15,6 +15,7 @@ written anew every minute; at the end the last policy is scored on unseen ground
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import importlib
 import json
@@ -23,8 +24,8 @@ import time
 import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -47,8 +48,8 @@ class OutOfTime(Exception):
     """Ends a training of brax, which has no end of its own but its steps."""
 
 
-class Run:
-    """One training by one of brax's learners, whose policy is scored by the judge of this benchmark.
+class Scorer:
+    """Stands in for brax's evaluator: scores the policy of every epoch by this benchmark's judge, until time is up.
 
     Args:
       args: the command line. env, params: where policies are scored.
@@ -57,55 +58,27 @@ class Run:
 
     def __init__(self, args: argparse.Namespace, env: Any, params: Any, clock: Clock, keep: Callable[[dict], None]):
         self.args, self.env, self.params, self.clock, self.keep = args, env, params, clock, keep
-        act = {"policy": lambda p, state, key: self.make_policy(p)(state.obs, key)[0]}
-        self.judge = Judge(env, args.episodes, act)
         self.rows: list[dict[str, Any]] = []
         self.walltimes: list[float] = []
 
-    def train(self, name: str, settings: dict[str, Any]) -> None:
-        """Trains with `ppo` or `sac` until the time is up; a score takes the place of brax's evaluator."""
-        from brax.training import acting
+    def __call__(self, _: Any, make_policy: Any, **__: Any) -> Scorer:
+        """Itself, with a judge of the training's policies: brax calls this to make its evaluator."""
+        act = {"policy": lambda params, state, key: make_policy(params)(state.obs, key)[0]}
+        self.judge = Judge(self.env, self.args.episodes, act)
+        return self
 
-        from lunar_mjx.envs.brax_env import BraxEnv, wrap
-
-        agent = f"brax.training.agents.{name}"
-        learner, networks = (importlib.import_module(f"{agent}.{part}") for part in ("train", "networks"))
-        make_networks = getattr(networks, f"make_{name}_networks")
-        per_epoch = SETTINGS["per_epoch"][name] * math.prod(settings[k] for k in SETTINGS["step"][name])
-
-        def evaluator(_: Any, make_policy: Any, **__: Any) -> Any:
-            def run_evaluation(params: Any, training_metrics: Any, **_: Any) -> dict[str, Any]:
-                return {"seen": (float(training_metrics.get("training/walltime", 0.0)), make_policy, params)}
-
-            return SimpleNamespace(run_evaluation=run_evaluation)
-
-        theirs, acting.Evaluator = acting.Evaluator, evaluator
-        try:
-            learner.train(
-                BraxEnv(self.env),
-                num_timesteps=MOST_EPOCHS * per_epoch,
-                num_evals=MOST_EPOCHS + 1,
-                episode_length=self.env.episode_steps,
-                wrap_env_fn=wrap,
-                network_factory=functools.partial(make_networks, **SETTINGS["networks"][name]),
-                seed=self.args.seeds[0],
-                deterministic_eval=True,
-                max_devices_per_host=1,
-                progress_fn=lambda steps, metrics: self.look(steps, *metrics["seen"]),
-                num_eval_envs=1,
-                **settings,
-            )
-        except OutOfTime:
-            pass
-        finally:
-            acting.Evaluator = theirs
-
-    def look(self, steps: int, walltime: float, make_policy: Any, policy: Any) -> None:
-        """Scores the policy; the first call, before any training, compiles the judge beside brax's own compiling."""
-        self.make_policy, self.policy = make_policy, policy
-        self.walltimes.append(walltime)
+    def run_evaluation(self, policy: Any, training_metrics: Any, **_: Any) -> dict[str, Any]:
+        """No metrics: notes the policy and brax's own count of s, and before any training begins to compile."""
+        self.policy = policy
+        self.walltimes.append(float(training_metrics.get("training/walltime", 0.0)))
         if len(self.walltimes) == 1:
+            # beside brax's own compiling
             self.ready = ThreadPoolExecutor(1).submit(self.judge.compile, self.params, policy)
+        return {}
+
+    def look(self, steps: int, _: Any) -> None:
+        """Scores the policy that was noted, after so many environment steps."""
+        if not steps:  # nothing is learnt yet, and the judge is being compiled
             return
         self.ready.result()
         self.rows.append({"steps": int(steps), **self.score(DURING)})
@@ -114,7 +87,7 @@ class Run:
             raise OutOfTime
 
     def score(self, seed: int) -> dict[str, Any]:
-        """Score of the last parameters."""
+        """Score of the policy that was noted last."""
         return self.judge(self.params, self.policy, seed)["policy"]
 
     def record(self) -> dict[str, Any]:
@@ -124,6 +97,33 @@ class Run:
         rows = [{**row, "elapsed_s": t} for row, t in zip(self.rows, times, strict=True)]
         about = {"first_epoch_s": first, "process_s": self.clock.spent}
         return {"unseen": rows, **about, **reached(rows, self.args.target)}
+
+
+def learn(name: str, settings: dict[str, Any], scorer: Scorer) -> None:
+    """Trains with brax's `ppo` or `sac` until the scorer ends it."""
+    from brax.training import acting
+
+    from lunar_mjx.envs.brax_env import BraxEnv, wrap
+
+    agent = f"brax.training.agents.{name}"
+    learner, networks = (importlib.import_module(f"{agent}.{part}") for part in ("train", "networks"))
+    make_networks = getattr(networks, f"make_{name}_networks")
+    per_epoch = SETTINGS["per_epoch"][name] * math.prod(settings[k] for k in SETTINGS["step"][name])
+    with mock.patch.object(acting, "Evaluator", scorer), contextlib.suppress(OutOfTime):
+        learner.train(
+            BraxEnv(scorer.env),
+            num_timesteps=MOST_EPOCHS * per_epoch,
+            num_evals=MOST_EPOCHS + 1,
+            episode_length=scorer.env.episode_steps,
+            wrap_env_fn=wrap,
+            network_factory=functools.partial(make_networks, **SETTINGS["networks"][name]),
+            seed=scorer.args.seeds[0],
+            deterministic_eval=True,
+            max_devices_per_host=1,
+            progress_fn=scorer.look,
+            num_eval_envs=1,
+            **settings,
+        )
 
 
 def brax(args: argparse.Namespace, clock: Clock) -> None:
@@ -143,13 +143,13 @@ def brax(args: argparse.Namespace, clock: Clock) -> None:
             runs[name] |= record
             save(args.out, "brax", told)
 
-        run = Run(args, env, unseen, Clock(clock.left / (2 - i) - 8.0), keep)
+        scorer = Scorer(args, env, unseen, Clock(clock.left / (2 - i) - 8.0), keep)
         try:
-            run.train(name, settings)
-            keep({**run.record(), "final": run.score(FINAL)})
-            say(f"{name}: {success_text(runs[name]['final'])} after {run.rows[-1]['steps']:,} steps")
+            learn(name, settings, scorer)
+            keep({**scorer.record(), "final": scorer.score(FINAL)})
+            say(f"{name}: {success_text(runs[name]['final'])} after {scorer.rows[-1]['steps']:,} steps")
         except Exception as error:  # the other one still runs
-            keep({**run.record(), "error": f"{type(error).__name__}: {error}"})
+            keep({**scorer.record(), "error": f"{type(error).__name__}: {error}"})
             say(f"{name}: {runs[name]['error']}")
 
 

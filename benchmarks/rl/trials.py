@@ -26,13 +26,13 @@ from typing import Any
 import harness
 import jax
 import numpy as np
-from harness import COMMIT, DURING, EXPERIMENTS, FINAL, KEPT, TREE, Clock, Judge, Setup, ends, read, say, when
+from harness import COMMIT, DURING, EXPERIMENTS, FINAL, KEPT, TREE, Clock, Judge, Setup, read, say, show, when
 from rates import Driven
 
 from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.evaluate import success_text
 from lunar_mjx.agents.policy import policy_of, save_policy
-from lunar_mjx.agents.train import RunConfig, train
+from lunar_mjx.agents.train import RunConfig
 from lunar_mjx.commands.train import env_options
 from lunar_mjx.envs import make_agent, make_navigation
 from lunar_mjx.envs.navigation.observations import CAMERA
@@ -118,7 +118,7 @@ class Trials:
                 self.store(seed, state, row, found[self.own])
             self.save()
             say(f"{row['steps']:.3g} steps, {row['elapsed_s']:.0f} s, {self.choose_by} {success_text(chosen)}")
-            shown(found)
+            show(found)
             return good
 
         def after_epoch(_: Any, state: Any, row: dict[str, Any]) -> dict[str, Any]:
@@ -131,7 +131,7 @@ class Trials:
 
         seconds = min(args.seed_seconds, max(1.0, self.clock.left - args.last))
         config = RunConfig(int(args.steps), seed, seconds, math.inf, quiet=True, begin_with=args.begin_with)
-        result = train(setup.learner, config, None, setup.environment, after_epoch)
+        result = setup.train(config, after_epoch)
         last = run["epochs"][-1]
         if math.isinf(args.every):
             best = (0.0, setup.policy(result.state), last)
@@ -144,14 +144,7 @@ class Trials:
             self.store(seed, result.state, row, found[self.own])
         self.save()
         say(f"seed {seed} after {self.clock.spent:.0f} s, {last['steps']:.3g} steps, {last['steps_per_s']:.3g} steps/s")
-        shown(found)
-
-
-def shown(rows: Mapping[str, Any]) -> None:
-    """Prints the rows of a score."""
-    for agent, one in rows.items():
-        costs = "" if one["spl"] is None else f"SPL {one['spl']:.2f}, {one['collisions_per_km']:.0f}/km, "
-        say(f"    {agent}: {success_text(one)}, {costs}{ends(one)}")
+        show(found)
 
 
 def rules(env: Any, names: Sequence[str]) -> dict[str, Any]:
