@@ -29,6 +29,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input, require_finite
 from lunar_mjx.rover import Rover
@@ -153,6 +154,7 @@ class Effect:
         steady-state wheel test bed leaves it out.
       requires: names of effects whose parameters it reads: they must be in the list.
       validate: refuses values that make no sense together or for the rover, though each is within its bounds.
+      mapped: parameters whose place the soil grids of a terrain take where they hold them; `validate` sees those, too.
       recall: what its state says about the contact of wheel and ground, for the ports from `soil` on: the only way by
         which one effect's state is seen by others.
       doc: equation and source.
@@ -169,6 +171,7 @@ class Effect:
     requires: tuple[str, ...] = ()
     validate: Validate | None = None
     recall: Recall | None = None
+    mapped: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -236,7 +239,7 @@ class Effect:
         """Refuses values that make no sense together, or for the rover.
 
         Args:
-          values: of all parameters, each checked by itself.
+          values: of all parameters, each checked by itself or, where a terrain maps it, an array over the map.
           rover: that is to have the effect.
           source: file or function to name in the error.
 
@@ -245,8 +248,10 @@ class Effect:
         """
         refusal = None if self.validate is None else self.validate(values, rover)
         if refusal is not None:
-            field = f"effects.{self.name}.{refusal.parameter}"
-            raise bad_input(source, field, values[refusal.parameter], refusal.problem, refusal.remedy)
+            field, value = f"effects.{self.name}.{refusal.parameter}", values[refusal.parameter]
+            # A map has thousands of values, of which a sentence holds two.
+            shown = f"{np.min(value):g} to {np.max(value):g}" if np.ndim(value) > 1 else value
+            raise bad_input(source, field, shown, refusal.problem, refusal.remedy)
 
 
 def effect(
@@ -259,6 +264,7 @@ def effect(
     requires: tuple[str, ...] = (),
     validate: Validate | None = None,
     recall: Recall | None = None,
+    mapped: tuple[str, ...] = (),
     **parameters: Parameter,
 ) -> Callable[[PortFunction], Effect]:
     """Decorator: makes an `Effect` of a function at one port; the function's docstring states equation and source."""
@@ -276,6 +282,7 @@ def effect(
             requires=requires,
             validate=validate,
             recall=recall,
+            mapped=mapped,
         )
 
     return build

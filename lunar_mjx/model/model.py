@@ -12,7 +12,6 @@ import numpy as np
 from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.joint.motor import MODES, WINDINGS
-from lunar_mjx.effects.soil.ground import least_stiffness
 from lunar_mjx.errors import bad_input, require_finite
 from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.model.posterior import Posterior
@@ -238,7 +237,7 @@ def check_effects(model: Model, source: str | Path) -> None:
     """Refuses a list of effects that cannot run, alone or on the model's terrain.
 
     Raises:
-      UserError: an effect needs another one that is not in the list, or the soil's moduli pull wheels down somewhere.
+      UserError: an effect needs another one that is not in the list, or refuses what the terrain's maps hold.
     """
     present = set(model.effect_names)
     for missing in dict.fromkeys(name for e in model.effects for name in e.requires if name not in present):
@@ -250,24 +249,12 @@ def check_effects(model: Model, source: str | Path) -> None:
             f"lacks {missing}, which {needy[0]} reads",
             f"add {missing} or take out {', '.join(needy)}",
         )
-    _check_moduli(model, source)
-
-
-def _check_moduli(model: Model, source: str | Path) -> None:
-    """Refuses soil grids in which k_c/b + k_phi is not positive under the narrowest wheel."""
     layers = {} if model.terrain.grids is None else model.terrain.grids.layers
-    if "soil" not in model.effect_names or not {"k_c", "k_phi"} & set(layers):
-        return
-    k_c, k_phi = (layers.get(k, model.parameters["soil"][k]) for k in ("k_c", "k_phi"))
-    width, least = least_stiffness(k_c, k_phi, [wheel.width for wheel in model.rover.wheels])
-    if least <= 0.0:
-        raise bad_input(
-            source,
-            f"soil grids of {model.terrain.name}: k_c/b + k_phi",
-            f"{least:g} N/m^(n+2)",
-            f"is not positive under a wheel b = {width:g} m wide",
-            "give a larger k_c or k_phi there",
-        )
+    for effect in model.effects:
+        mapped = {name: layers[name] for name in effect.mapped if name in layers}
+        if mapped:
+            values = {**model.parameters[effect.name], **mapped}
+            effect.check_together(values, model.rover, f"{source}: soil grids of {model.terrain.name}")
 
 
 _POSITION_RATE = 20.0

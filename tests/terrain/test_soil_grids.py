@@ -258,5 +258,7 @@ def test_broken_archive(tmp_path):
 
 def test_soil_that_pulls_wheels_down_is_refused():
     bad = SoilGrids(*map(jnp.asarray, (-1.0, -1.0, 1.0)), k_c=jnp.full((3, 3), -1e6))
-    with pytest.raises(UserError, match=r"k_c.*not positive"):
+    with pytest.raises(
+        UserError, match=r"test: soil grids of flat: effects\.soil\.k_c = '-1e\+06 to -1e\+06'.*not positive"
+    ):
         check_effects(make_model("luvmi_x", dataclasses.replace(flat(), grids=bad)), "test")

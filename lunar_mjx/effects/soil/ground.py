@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -17,16 +17,11 @@ from lunar_mjx.terrain.soil.named import BOUNDS
 _SOURCEBOOK = "Heiken et al. 1991, Lunar Sourcebook, ch. 9"
 
 
-def least_stiffness(k_c: Any, k_phi: Any, wheel_widths: Sequence[float]) -> tuple[float, float]:
-    """Width of the narrowest wheel, m, and the least k_c/b + k_phi under it, N/m^(n+2), of one soil or of a grid."""
-    # The narrowest wheel decides: k_c/b counts most under it, and only a negative k_c can make the sum negative.
-    narrowest = min(wheel_widths)
-    return narrowest, float(np.min(np.asarray(k_c, float) / narrowest + np.asarray(k_phi, float)))
-
-
 def _positive_stiffness(values: Mapping[str, Any], rover: Rover) -> Refusal | None:
-    """Refuses a soil that would pull a wheel down: k_c/b + k_phi must be positive for every width b of a wheel."""
-    narrowest, stiffness = least_stiffness(values["k_c"], values["k_phi"], [w.width for w in rover.wheels])
+    """Refuses a soil, or a map of soils, that would pull a wheel of width b down: k_c/b + k_phi must be positive."""
+    # The narrowest wheel decides: k_c/b counts most under it, and only a negative k_c can make the sum negative.
+    narrowest = min(wheel.width for wheel in rover.wheels)
+    stiffness = float(np.min(np.asarray(values["k_c"], float) / narrowest + np.asarray(values["k_phi"], float)))
     if stiffness > 0.0:
         return None
     return Refusal(
@@ -42,6 +37,8 @@ def _positive_stiffness(values: Mapping[str, Any], rover: Rover) -> Refusal | No
     # First of all effects on soil: those after it scale what it sets, and would be overwritten if it came later.
     order=-100,
     validate=_positive_stiffness,
+    # A map's tan_phi is no parameter of this name: it takes the place of the friction angle.
+    mapped=("k_c", "k_phi", "n", "cohesion", "shear_modulus_x", "shear_modulus_y"),
     k_c=Parameter(1.4e3, None, BOUNDS["k_c"], "N/m^(n+1)", "cohesive modulus of sinkage", _SOURCEBOOK),
     k_phi=Parameter(8.2e5, None, BOUNDS["k_phi"], "N/m^(n+2)", "frictional modulus of sinkage", _SOURCEBOOK),
     n=Parameter(1.0, None, BOUNDS["n"], "1", "sinkage exponent", _SOURCEBOOK),
