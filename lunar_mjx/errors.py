@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 EXIT_STATUS = 2
+"""Exit status of a command that a mistake of the user's ends."""
 LONGEST_PATH = 4000
 """Characters; what is longer is no path anywhere."""
 

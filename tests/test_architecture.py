@@ -313,7 +313,7 @@ UNCHECKED = {
     "dynamics/spatial_algebra.py": (6, SUMS),
     "envs/sb3.py": (1, OPTIONAL),
     "inference/coordinates.py": (1, "a sorted pair is a list to the type checker"),
-    "logs/readers/bags.py": (6, OPTIONAL),
+    "logs/readers/bags.py": (4, OPTIONAL),
     "spatial.py": (2, SUMS),
     "terrain/sky/ephemeris.py": (4, OPTIONAL),
     "wheel_bed/particles/kernels.py": (2, "Warp compiles these functions, with types of its own"),

@@ -11,6 +11,7 @@ from lunar_mjx.errors import bad_input
 from lunar_mjx.model import Model
 
 _WHEELS, _TERRAIN = 2, 4
+"""Bits of Bullet's collision filter: wheels and terrain meet each other, and nothing else meets either."""
 
 
 class BulletGround:

@@ -135,7 +135,7 @@ class RoverInSand(NativeBackend):
 
     @property
     def weight(self) -> float:
-        """Of the rover, N."""
+        """Weight of the rover, N."""
         return float(self._mj.body_subtreemass[self._chassis]) * self.model.gravity
 
     def place_above(self, plane: Plane, x: float, y: float, yaw: float, clearance: float) -> None:
@@ -256,7 +256,7 @@ class RoverInSand(NativeBackend):
             raise FloatingPointError(f"the rover's place is not finite after step {balance.steps} of the sand")
 
     def _momentum(self) -> np.ndarray:
-        """Of the whole rover, (3,), N s."""
+        """Momentum of the whole rover, (3,), N s."""
         twist = self._seen["cvel"][0]
         middle = self._seen["xipos"][0] - self._seen["subtree_com"][0, self._chassis]
         velocity = twist[:, 3:] + np.cross(twist[:, :3], middle)

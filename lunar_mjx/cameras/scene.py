@@ -203,7 +203,7 @@ def _surface(patch: Patch, lower: Any) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _add_far(spec: Any, terrain: Terrain, near: Patch) -> None:
-    """The rest of the terrain, coarse, lowered where the near ground covers it."""
+    """Adds the whole terrain as a coarse mesh, lowered where the near ground covers it."""
     field = terrain.field
     rows, cols = np.asarray(field.heights).shape
     origin, cell = np.array([float(field.x0), float(field.y0)]), float(field.cell)

@@ -43,6 +43,7 @@ from lunar_mjx.files import replacing
 from lunar_mjx.trust import trusting
 
 INTERRUPTED = 130
+"""Exit status of a command that Ctrl-C ended: 128 and the number of SIGINT, as in shells."""
 TRUST = "--trust"
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """What a write says to a full disk, a spent quota and a file that may not grow."""

@@ -23,6 +23,7 @@ from lunar_mjx.wheel_bed.soil_fit import SOIL_FIT
 
 ROVERS = {"viper": ("VIPER", BLUE), "luvmi_x": ("LUVMI-X", VERMILION)}
 _MARGIN = 5.0
+"""Ground that is drawn beyond the given ranges, on every side, m."""
 
 CASE_STYLE: dict[str, Series] = {
     "paper": SERIES[0],

@@ -25,15 +25,15 @@ class RandomRovers:
     slope: float = 0.1
     """Inclination of the probe's ground, rad."""
     radius: float = 0.25
-    """Of the wheels, m."""
+    """Radius of the wheels, m."""
     width: float = 0.2
-    """Of the wheels, m."""
+    """Width of the wheels, m."""
     timestep: float = 0.002
-    """s, that of a model unless it says otherwise."""
+    """Time step, s: that of a model unless it says otherwise."""
     gravity: float = 1.625
-    """m/s2, on the Moon."""
+    """Gravity on the Moon, m/s2."""
     ambient: float = 250.0
-    """K."""
+    """Temperature around the rover, K."""
     warm_up: int = 2
     """Steps before the one that is looked at, from which effects have their memory."""
 

@@ -27,7 +27,7 @@ from lunar_mjx.errors import bad_input
 
 NAVIGATION, POINT = "LunarMJX/Navigation-v0", "LunarMJX/Point-v0"
 _BOUND = 1e6
-"""Of observations: they have no hard bound, and Gymnasium warns of infinite ones."""
+"""Bound of observations that their space states: they have none, and Gymnasium warns of infinite ones."""
 RENDER_MODES = ("rgb_array",)
 
 

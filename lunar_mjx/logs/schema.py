@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import re
 from collections.abc import Mapping
 
@@ -125,7 +126,7 @@ GREATEST_GRAVITY = 100.0
 """m/s2: of a centrifuge with a test bed in it; no rover meets more."""
 LATEST = 1e11
 """s: no clock counts 3000 years."""
-ANGLE_LIMIT = 2.0 * 3.141592653589793
+ANGLE_LIMIT = math.tau
 """Steering and suspension joints do not turn further, rad; wheels do."""
 
 STEADY_CHANNELS: Mapping[str, tuple[str, float, float]] = {

@@ -64,7 +64,7 @@ def answer_path(out: Path) -> Path:
 
 
 def write_answer(answer: Answer, path: Path) -> None:
-    """Writes an answer; `read_answer` gives the same one back."""
+    """Writes an answer, which `read_answer` reads back."""
     write_text(path, tomli_w.dumps({"format": FORMAT, **dataclasses.asdict(answer)}))
 
 

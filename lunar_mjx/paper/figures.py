@@ -19,6 +19,7 @@ from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, darkened,
 
 PRESET_NAMES = ("paper", "consistent")
 SLOPES_DEG = (0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5, 25.0)
+"""Slopes that VIPER drives up, deg; closer from 10 deg on, where its slip rises fast."""
 STALL_SLIP = 0.95
 """Slip of the whole rover at which it is called stalled."""
 

@@ -27,9 +27,9 @@ class Agreement:
     """How closely the two files of a rover must agree: both are written with twelve digits or more."""
 
     mass: float = 1e-9
-    """Of the total mass, relative."""
+    """Relative difference of the total masses."""
     gravity: float = 1e-9
-    """m/s2, of rounding in the two files."""
+    """Difference of the gravities, m/s2: rounding in the two files."""
 
 
 AGREEMENT = Agreement()

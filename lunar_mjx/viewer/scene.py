@@ -108,7 +108,7 @@ def _grid(patch: Patch) -> dict[str, Any]:
 
 
 def _rocks(terrain: Terrain, near: Patch) -> list[list[float]]:
-    """Of the rocks on the fine ground the centre x, y, z and the three semi-axes as vectors, (12,) m each."""
+    """Centre and the three semi-axes of every rock on the fine ground, as vectors one after another, (12,) m."""
     if terrain.rocks is None:
         return []
     centers, (axes, turns) = np.asarray(terrain.rocks.centers, float), semi_axes(terrain.rocks)

@@ -40,17 +40,17 @@ class RecordedDrive:
 
     @property
     def time(self) -> np.ndarray:
-        """s."""
+        """Time since the drive began, (time,) s."""
         return self.table["time_s"].to_numpy(float)
 
     @functools.cached_property
     def position(self) -> np.ndarray:
-        """Of the chassis frame, (time, 3) m."""
+        """Position of the chassis frame, (time, 3) m."""
         return self.columns([f"position_{a}_m" for a in "xyz"])
 
     @functools.cached_property
     def speed(self) -> np.ndarray:
-        """Over the ground, (time,) m/s."""
+        """Speed over the ground, (time,) m/s."""
         return np.hypot(*np.gradient(self.position[:, :2], self.time, axis=0).T)
 
     @property
@@ -78,7 +78,7 @@ class RecordedDrive:
 
     @functools.cached_property
     def slope(self) -> np.ndarray:
-        """Of the ground under the chassis, (time, 2) deg: along the heading (positive uphill), and up to the left."""
+        """Slope of the ground under the chassis, (time, 2) deg: along the heading (positive uphill), up to the left."""
         x, y = self.position[:, 0], self.position[:, 1]
         east, north = (np.asarray(v, float) for v in gradient(self.model.terrain.field, x, y))
         yaw = np.radians(self.columns(["yaw_deg"])[:, 0])

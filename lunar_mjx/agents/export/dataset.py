@@ -29,7 +29,7 @@ DATA, METADATA = "main_data.hdf5", "metadata.json"
 MINARI = "0.5.4"
 """Version of Minari whose layout is written."""
 _BOUND = 1e6
-"""Of observations, as in `envs.gymnasium_env`."""
+"""Bound of observations that a dataset states: they have none, and Gymnasium warns of infinite ones."""
 _NAME = re.compile(r"(\w[\w-]*/)*\w[\w-]*-v\d+")
 _PIECE = 50
 """Steps that run on the device between transfers."""

@@ -28,7 +28,7 @@ class OnnxVersion:
     opset: int = 17
     ir_version: int = 8
     layer_norm_epsilon: float = 1e-6
-    """Of Flax's `LayerNorm`, which the actor's layers use."""
+    """What Flax's `LayerNorm` adds to a variance; the actor's layers are normalised by it."""
 
 
 ONNX = OnnxVersion()

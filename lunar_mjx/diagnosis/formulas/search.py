@@ -103,8 +103,8 @@ class Found:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Scores:
-    """Of a library at a fit: chi-square, amount in visible ones, signature, scale of the factor, and the baseline's
-    columns beside it."""
+    """Scores of a library's formulas at a fit: chi-square, amount in visible ones, signature, scale of the factor, and
+    the baseline's columns beside it."""
 
     choices: Sequence[Choice]
     chi2: np.ndarray

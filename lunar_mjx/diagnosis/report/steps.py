@@ -12,6 +12,7 @@ from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.score import blocks
 
 _DRAWS = 1000
+"""Bootstrap draws of an interval: 25 of them lie beyond either end of its 95 %."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

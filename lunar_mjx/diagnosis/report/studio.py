@@ -187,7 +187,7 @@ def _unit(name: str, split: str) -> dict[str, str]:
 
 
 def _models(result: Result, traces: Traces) -> list[_Model]:
-    """As given, refitted, and with every effect of which the folder tells something, best first within each kind."""
+    """Models to draw: as given, refitted, and with each effect that the folder tells of, best first of each kind."""
     o = traces.observations
     models = []
     for row, label in enumerate(traces.labels):

@@ -17,6 +17,7 @@ from lunar_mjx.model.describe import by_group
 from lunar_mjx.report.page import Block, Facts, Table, Text
 
 _MOST_ROWS = 30
+"""Channels and manoeuvres that a page lists at most, the worst first."""
 
 
 def plus_minus(value: Any, std: Any, unit: str = "") -> str:

@@ -199,6 +199,7 @@ class TableProblem(Problem):
 
 _PROGRAMS: dict[Any, tuple[WheelBed, Any, Any]] = {}
 _MOST_PROGRAMS = 24
+"""Compiled beds that a process keeps at most, each with its code in memory; the oldest goes first."""
 
 
 def _programs(

@@ -49,7 +49,7 @@ SHARES: Mapping[str, float] = {
     "body_wrench: push": ADDED,
     "body_wrench: pitching moment": ADDED,
 }
-"""Of the fields whose size is not that of a gain; the others are gains."""
+"""Relative sizes of fields, by name; a field that is not listed is a gain and has that of gains."""
 
 
 DRAWBAR = 0.1

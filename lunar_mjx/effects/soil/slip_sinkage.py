@@ -24,6 +24,7 @@ def with_exponent(ctx, ground, change):
 
 
 _SOFTER = (0.0, 5.0)
+"""Bounds of a growth of the sinkage exponent: slip does not firm soil; five times the nominal growth is a choice."""
 
 
 @effect(

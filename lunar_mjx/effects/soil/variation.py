@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from lunar_mjx.effects.base import Effect, Parameter, effect
 
 _EXPONENT = (-2.0, 2.0)
+"""Bounds of an exponent of gravity: twice the largest that is proposed, and either sign (a choice)."""
 
 
 @effect(

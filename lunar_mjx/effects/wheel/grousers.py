@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, StateVariable, effect
-
-_TURN = 6.283185307179586
 
 
 @effect(
@@ -40,7 +39,7 @@ def grousers(ctx, p, x, wheel):
     Kubota's (2011) ratio of the grousers' faces to the rim, up to a largest value.
     """
     # Area of the grousers' faces over that of the rim between them.
-    faces = p.count * p.height / (_TURN * ctx.geometry.radius)
+    faces = p.count * p.height / (math.tau * ctx.geometry.radius)
     lug = p.area_share * p.height * jnp.ones_like(wheel.slip_x)
     # Both factors go by the height, so that grousers of height zero change nothing.
     return dataclasses.replace(wheel, lug=lug, grip=1.0 + jnp.minimum(faces, p.largest - 1.0))
@@ -79,4 +78,4 @@ def grouser_pulsation(ctx, p, x, ground):
         ground, k_c=ground.k_c * factor, k_phi=ground.k_phi * factor, cohesion=ground.cohesion * factor
     )
     # Kept within one turn: in float32 the angle of a long drive would lose the position of the teeth.
-    return soil, {"angle": jnp.mod(x.angle + ctx.dt * turn, _TURN)}
+    return soil, {"angle": jnp.mod(x.angle + ctx.dt * turn, math.tau)}

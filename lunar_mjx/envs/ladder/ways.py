@@ -22,7 +22,7 @@ class WayLimits:
     """Slope up to which ways are planned, rad: LUVMI-X in the preset `consistent` still climbs 12 deg (slip 0.83) and
     slides back on 15 deg."""
     level: float = 0.7
-    """Share of it up to which a rover may start or arrive."""
+    """Share of `steepest` up to which the ground of a start or goal may slope."""
     room: float = 0.9
     """m around a start or goal that are free of boulders, for a rover as wide as LUVMI-X: enough to turn."""
     half_width: float = 0.4

@@ -74,7 +74,7 @@ def spin(system: System, params: Params, axes: Any, physics: Physics, actions: A
 
 
 def stuck_ones(physics: Physics, drawn: dict[str, Any], stuck: Any) -> Dug:
-    """As many rovers as were tried, of those that got stuck; repeated in turn where some did not.
+    """Rovers that got stuck, repeated in turn until there are as many as were tried.
 
     Raises:
       UserError: none got stuck.

@@ -13,7 +13,7 @@ from lunar_mjx.pytree import pytree
 from lunar_mjx.terrain import Terrain, form_at, nearest_rock, sample
 
 METRICS = ("travelled", "shortest", "energy", "slip", "collisions")
-"""Of an episode: length of its way and of the shortest one, m; energy drawn, J; mean slip; boulders hit."""
+"""Numbers of an episode: length of its way and of the shortest one, m; energy drawn, J; mean slip; boulders hit."""
 
 
 @pytree

@@ -29,11 +29,11 @@ class SandBoxNumbers:
     """Numbers of the box of sand that no user sets."""
 
     damping: float = 1.0
-    """Of the wheel's vertical motion, over critical damping by a spring m g/R: what is asked for is the mean."""
+    """Damping of the wheel's vertical motion, over critical damping by a spring m g/R: only its mean place counts."""
     jitter: float = 0.8
     """Range by which particles are moved off their lattice, in its spacings."""
     floor_friction: float = 0.6
-    """Of the box's floor; its sides are smooth."""
+    """Friction of the box's floor; its sides are smooth."""
     look_every: int = 40
     """Time steps between looks for numbers that are not finite."""
 
