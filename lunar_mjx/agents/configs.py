@@ -195,6 +195,7 @@ def override(training: Training, **values: Any) -> Training:
       UserError: neither has such a field.
     """
     train, algorithm = training.train, training.train.algorithm
+    # A setting that the algorithm does not read would be taken, and change nothing.
     unused = {"algorithm", *_unused(algorithm)}
     for name, value in values.items():
         if name in {f.name for f in dataclasses.fields(train)} - unused:

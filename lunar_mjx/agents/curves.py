@@ -73,6 +73,7 @@ def draw_mean(
 ) -> None:
     """Draws moving means by episode: mean over seeds and its 95 % interval, as far as every seed has episodes."""
     smooth = [factor * moving_mean(curve) for curve in curves]
+    # Beyond the shortest seed the mean would be of other seeds, and jump.
     count = min(map(len, smooth))
     mean, low, high = mean_interval(np.stack([curve[:count] for curve in smooth]))
     at = np.arange(1, count + 1)

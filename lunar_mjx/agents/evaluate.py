@@ -168,6 +168,7 @@ class Judge:
     ):
         rules = rules or {}
         self.names = (*policies, *rules)
+        # Which copy of the episodes an environment belongs to, and so which agent acts in it.
         row = jnp.repeat(jnp.arange(len(self.names)), episodes)
 
         def act(policy: Any, state: Any, key: Any) -> Any:

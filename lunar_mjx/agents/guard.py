@@ -77,6 +77,7 @@ def dump(guard: Guard, path: Path | None, envs_per_device: int) -> tuple[int, in
     Returns:
       The environment's number in the whole batch, and the iteration.
     """
+    # argmax of booleans is the first true one.
     device = int(np.argmax(np.asarray(guard.tripped)))
     one = jax.tree.map(lambda a: np.asarray(a)[device : device + 1], guard)
     number = device * envs_per_device + int(one.env[0])
@@ -95,6 +96,7 @@ def replay(env: Environment, path: Path) -> State:
       UserError: the file is missing, or of another environment.
     """
     with require_file(path, "the guard's dump").open("rb") as file, np.load(file, allow_pickle=False) as data:
+        # Shapes tell what a state of this environment holds, without making one.
         shapes = jax.eval_shape(env.reset, env.params, jax.ShapeDtypeStruct((1, 2), jnp.uint32))
         stored_leaves = []
         for place, leaf in jax.tree_util.tree_leaves_with_path(shapes):

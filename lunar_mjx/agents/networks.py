@@ -55,6 +55,7 @@ def check_rates(source: str, config: Any) -> None:
     require_within(source, "gamma", config.gamma, 0.0, 1.0)
     require_within(source, "tau", config.tau, 0.0, 1.0, above=True)
     for name in ("actor_layers", "critic_layers"):
+        # More than 100,000 units a layer is a slip of the keyboard, and would only fail when memory runs out.
         for width in getattr(config, name):
             require_within(source, name, width, 1.0, 1e5)
 
@@ -115,6 +116,7 @@ def make_eye(picture: Sequence[int], filters: Sequence[int], activation: str = "
         return {f"conv_{i}": {"kernel": k, "bias": jnp.zeros(k.shape[-1])} for i, k in enumerate(kernels)}
 
     def apply(params: Any, x: Any) -> Any:
+        # Observations are flat; leading axes become one, since a convolution takes a batch of pictures.
         seen = x[..., start:stop].reshape(-1, rows, columns, colours)
         for i in range(len(filters)):
             layer = params[f"conv_{i}"]

@@ -79,6 +79,7 @@ def open_agent(name: str, task: str = "large", options: dict[str, Any] | None = 
             # The mapper drives by a block that policies do not all have.
             options = {**options, "observations": (*TASKS[task].observations, "plan")}
         env = make("navigation", **{"task": task, **options})
+        # Agents without a policy were trained nowhere: they are scored where trained ones are.
         unseen = {"terrain": "world:heldout", "ranges": "unseen"} if task == "large" else {}
         if task.startswith("ladder/"):
             unseen = UNSEEN_LADDER
@@ -186,6 +187,7 @@ class Episode:
             np.savetxt(part, table, delimiter=",", header=",".join(names), comments="", fmt="%.6g")
         with replacing(picture) as part:
             Image.fromarray(still).save(part)
+        # A long drive keeps its file small by fewer pictures, not by smaller ones.
         stride = max(1, len(self.reward) // EPISODE_PICTURE.most_frames)
         images = [Image.fromarray(f) for f in frames]
         with replacing(video) as part:

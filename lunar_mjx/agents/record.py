@@ -28,8 +28,10 @@ class Record:
         self._path = folder / "progress.csv"
         self._names: list[str] = []
         self.rows: list[dict[str, Any]] = []
+        # What was written after the checkpoint that a training goes on from would stand twice in the curves.
         purge = int(rows[-1]["steps"]) + 1 if rows else None
         self._events = SummaryWriter(str(folder / "events"), purge_step=purge, flush_secs=30)
+        # Begun anew with the checkpoint's rows: the file may hold later ones, of a training that was killed.
         self._path.unlink(missing_ok=True)
         for row in rows:
             self._append(row)
@@ -43,6 +45,7 @@ class Record:
 
     def _append(self, row: dict[str, Any]) -> None:
         self.rows.append(row)
+        # A row may bring a new number, such as the first score: then the file is written anew, with one more column.
         known = list(dict.fromkeys([*self._names, *row]))
         whole = known != self._names
         self._names = known
@@ -71,6 +74,7 @@ class Progress:
     def show(self, row: dict[str, Any], final: bool = False) -> None:
         """Prints steps, rate, time left, return and success of a row."""
         now = time.monotonic()
+        # Epochs may take milliseconds; lines that fast cannot be read, and fill a log.
         if self._quiet or (now - self._last < self._every and not final):
             return
         self._last = now

@@ -64,6 +64,7 @@ def learner_agent(learner: Learner, blanked: Sequence[str] = ()) -> Any:
       learner: the learner. blanked: blocks of observations that the policy sees at their mean, which tells what they
         are worth to it; those that its environment lacks say nothing.
     """
+    # Environments other than navigation name no blocks: nothing of theirs can be blanked.
     places = getattr(learner.env, "blocks", {})
     blank = np.zeros(learner.env.observation_size, bool)
     for name in set(blanked) & set(places):
@@ -119,6 +120,7 @@ class Scorer:
         self.scores.append({"steps": row["steps"], "elapsed_s": row["elapsed_s"], **score.record()})
         if score.success > self._best and self.folder is not None:
             self._best = score.success
+            # So that whoever finds the file alone knows how good it is, and after how much training.
             notes = {"score": score.record(), "steps": row["steps"], "elapsed_s": row["elapsed_s"]}
             save_policy(policy_of(learner, state, self.environment, notes), self.folder / "best_policy.npz")
         stop = self.target is not None and score.success >= self.target

@@ -25,6 +25,7 @@ def effect_test(
     from lunar_mjx.effect_contract.promises import check_effect
     from lunar_mjx.effects.catalogue import get, load_file
 
+    # A file may hold several effects; all are tested, so that none is forgotten.
     effects = list(load_file(spec).values()) if spec.endswith(".py") else [get(spec)]
     broken = []
     for effect in effects:

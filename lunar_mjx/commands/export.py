@@ -73,6 +73,7 @@ def dataset(
     options = env_options(env)
     made, act, ground = open_agent(wanted, task, options)
     params = unseen_params(made, ground) if unseen else made.params
+    # After the ground is chosen: an agent that knows the map must know this one.
     act = knowing(wanted, made, params, act)
     about = {"algorithm_name": wanted, "unseen": unseen, "options": options}
     print(export_dataset(made, params, act, make_folder(out), name, rovers, frames, seed, print, about))

@@ -35,6 +35,7 @@ def parity(
     from lunar_mjx.report import console_progress
 
     named = [e.strip() for e in engines.split(",") if e.strip()]
+    # An empty list would run the default engines, which is not what was asked for.
     if engines and not named:
         raise bad_input("parity", "--engines", engines, "names no engine", "leave it out for all that are installed")
     used, note = (named, "") if named else available(DEFAULT_ENGINES)

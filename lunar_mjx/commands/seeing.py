@@ -81,6 +81,7 @@ def render(
     from lunar_mjx.visual.video import render_video
 
     given = None if sun is None else _sun(sun)
+    # After the options are checked: reading a long drive takes seconds.
     drive = read_drive(run)
     light = given or camera_sun(drive.model.sun, float(drive.time[0]))
     with console_progress() as report:
@@ -164,6 +165,7 @@ def _sun(text: str) -> Any:
     from lunar_mjx.cameras import Sun
 
     azimuth, elevation = _numbers("--sun", text, ",", float)
+    # A turn to either side, since both 350 and -10 are in use for one place.
     require_within("lunar-mjx", "--sun", azimuth, -360.0, 360.0)
     return Sun(azimuth, elevation)
 
@@ -186,6 +188,7 @@ def _policy_drive(name: str, seed: int) -> PolicyDrive:
     env, agent, unseen = open_agent(name)
     # On standard error, since standard output carries the address for scripts.
     print("view: compiling, which can take some minutes the first time", file=sys.stderr)
+    # A file by its name, a shipped policy by its rover: what stands in the page's corner.
     shown = Path(name).stem if name.endswith(".npz") else f"{name}'s policy"
     drive = PolicyDrive(env, agent, shown, unseen_params(env, unseen), seed)
     if unseen:

@@ -128,6 +128,7 @@ def drive(
     # A stream for each kind of rover: leaving one out does not move the others.
     rng = np.random.default_rng([seed, *rover.encode()])
     starts = _starts(terrain, count, rng, shift * DEMO_DRIVE.spacing)
+    # A command holds for the time between two rows of the record.
     steps_per_record = round(1.0 / DEMO_DRIVE.records_per_second / system.dt)
     controls, speed = _controls(system, count, seconds, rng)
     # All rovers are one batch: one program is compiled for all of them.
@@ -155,6 +156,7 @@ def _starts(
     line = (np.arange(rows) - (rows - 1) / 2) * DEMO_DRIVE.spacing + shift
     cells = [(cx, cy) for cy in line for cx in line]
     places = []
+    # Off its cell's middle by up to 2 m: a row of rovers would meet a ridge all at once.
     for cx, cy in cells[:count]:
         x = y = 0.0
         # A cell without a good place keeps the last one that was tried: rovers are never fewer than asked for.
@@ -192,6 +194,7 @@ def _controls(
         rng.uniform(*DEMO_DRIVE.steering_amplitude, count),
         rng.uniform(*DEMO_DRIVE.steering_period, count),
     )
+    # Waves that begin anywhere, or all rovers would turn the same way first.
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
     ramp = np.minimum(time / DEMO_DRIVE.spin_up, 1.0)
     wave = amplitude[:, None] * np.sin(2.0 * np.pi * time[None, :] / period[:, None] + phase[:, None]) * ramp

@@ -84,6 +84,7 @@ def paths_figure(drives: Sequence[Drive], terrain: Terrain) -> go.Figure:
             },
         )
     finish(figure, 640, margin={"l": 52, "r": 36, "t": 64, "b": 46})
+    # One scale for both axes, or paths and rocks would be distorted.
     figure.update_xaxes(title_text="east, m", range=[west, east], constrain="domain", showgrid=False)
     figure.update_yaxes(
         title_text="north, m", range=[south, north], scaleanchor="x", constrain="domain", showgrid=False
@@ -116,6 +117,7 @@ def _drawn(stone: np.ndarray) -> dict[str, Any]:
 def _add_rocks(figure: go.Figure, terrain: Terrain, box: tuple[float, float, float, float]) -> None:
     if terrain.rocks is None:
         return
+    # Shapes, since a marker keeps its size on the screen when one zooms in.
     shapes = [
         {**_drawn(stone), "line": {"width": 0.5}, "fillcolor": ROCK}
         for stone in rocks_within(terrain, np.array([box[0], box[2]]), np.array([box[1], box[3]]))
@@ -227,6 +229,7 @@ def history_figure(drives: Sequence[Drive], individuals: int = 3) -> go.Figure:
 def _band(figure, time, values, colour, row, column, individuals, legend) -> None:
     """One panel. Slip is not a number until the wheels roll; the band then starts later."""
     known = np.isfinite(values).any(axis=1)
+    # Few digits: every number stands in the page as text.
     time, values = time[known].round(3), values[known]
     low, middle, high = (f(values, axis=1).round(4) for f in (np.nanmin, np.nanmedian, np.nanmax))
     place = {"row": row, "col": column}
@@ -279,6 +282,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
     """Drawbar pull, side force and sinkage over slip, a column per slip angle; error bars: replicates."""
     rows = [row for row in WHEEL_ROWS if row[0] in table.measured]
     scatter = replicate_scatter()
+    # All curves first: their range sets the axes, which all columns share.
     curves = [dense_curves(bed, table, angles) for bed in beds]
     figure = make_subplots(
         rows=len(rows),
@@ -294,6 +298,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
         for row, (quantity, _, scale) in enumerate(rows, 1):
             place, legend = {"row": row, "col": column}, row == 1 and column == 1
             for case, curve in zip(cases, curves, strict=True):
+                # A case is drawn alike in all panels, and stands once in the legend.
                 style = CASE_STYLE.get(case.name, SERIES[3])
                 figure.add_scatter(
                     x=curve["slip_ratio"].round(3),
@@ -347,6 +352,7 @@ def wheel_figure(cases: Sequence[Case], table: SteadyStateTable, angles: Sequenc
     for row, (quantity, _, scale) in enumerate(rows, 1):
         drawn = np.concatenate([c[quantity].ravel() for c in curves] + [table.measured[quantity]]) * scale
         low, high = float(drawn.min()), float(drawn.max())
+        # A little room, so that no mark is cut by the frame.
         edge = 0.06 * (high - low)
         figure.update_yaxes(range=[low - edge, high + edge], row=row)
     figure.update_xaxes(dtick=0.5, range=[-1.08, 1.0])

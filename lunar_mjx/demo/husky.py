@@ -54,6 +54,7 @@ def husky_case(seed: int = 0, progress: Callable[[float], None] | None = None) -
     tell = progress or (lambda done: None)
     with tempfile.TemporaryDirectory() as folder:
         log_folder = Path(folder)
+        # By the steps that a user takes with an own recording, on a folder that is thrown away.
         import_drives(copy_example(log_folder / "recordings"), log_folder / "logs", MAP)
         floor = compare([log_folder / "logs" / FLOOR], hard_floor("husky"), log_folder / FLOOR, seed=seed)
         tell(0.5)
@@ -66,6 +67,7 @@ def husky_case(seed: int = 0, progress: Callable[[float], None] | None = None) -
         tell(1.0)
         time, measured, before = _series(sand.folder / "series.npz", "as given")
         after = _series(grown.folder / "series.npz", "refitted")[2]
+        # As fitted on the floor, refitted to the sand, and refitted with soft ground.
         first, last = (r.load("comparison.json") for r in (sand, grown))
         errors = (dict(first["as_given"]), dict(first["refitted"]), dict(last["refitted"]))
         return HuskyCase(time, measured, before, after, *errors, dict(sand.campaign()[0].source))
@@ -79,6 +81,7 @@ def _series(file: Path, label: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         part = slice(int(data["series_start"][at]), int(stops[at]))
         row = list(data["labels"]).index(label)
         values = data["time"][part], data["measured"][part], data["predicted"][row][part]
+    # Not a number between windows: else a line would be drawn across what was not simulated.
     gaps = np.flatnonzero(np.diff(values[0]) > 0.5) + 1
     time, measured, predicted = (np.insert(v.astype(float), gaps, np.nan) for v in values)
     return time, measured, predicted

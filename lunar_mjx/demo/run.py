@@ -74,6 +74,7 @@ def run_demo(
             # Half a spacing apart, so that the two kinds do not start on each other's places.
             drives.append(drive(name, rovers, seconds, seed, terrain, tell, shift=0.5 * i))
             done += share
+        # The wheel and the real drive are taken to need as long as each other.
         share = 0.5 * (0.95 - done)
         cases = wheel_cases(starts, seed, _part(report, "wheel against test bed", done, share))
         husky = husky_case(seed, _part(report, "a real Husky's drive", done + share, share))

@@ -180,6 +180,7 @@ def driving_section(drives: Sequence[Drive], terrain: Terrain) -> Section:
 def wheel_section(cases: Sequence[Case]) -> Section:
     """The wheel against the test bed: panels, errors, where they are worst, and the fitted values."""
     table = cases[0].comparison.table
+    # Rounded, since measured angles differ in their last digits.
     angles = sorted({round(float(a), 2) for a in table.test["slip_angle_deg"]})
     beds = [case.fit.bed if case.fit else as_bed(case.name) for case in cases]
     caption = (
@@ -204,6 +205,7 @@ def _scatter(quantity: str, sigma: float) -> str:
 
 
 def _error_table(cases: Sequence[Case]) -> Table:
+    # All cases are held against one table, so that they have these quantities in common.
     quantities = list(cases[0].comparison.rms)
     rows = []
     for case in cases:
@@ -277,6 +279,7 @@ def _label(case: Case) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of what made the report."""
+    # What rounding and compilation depend on; a run can be made again with these.
     packages = ("jax", "mujoco", "mujoco-mjx", "numpy", "scipy")
     return {"lunar-mjx": __version__, "python": platform.python_version(), **{p: metadata.version(p) for p in packages}}
 

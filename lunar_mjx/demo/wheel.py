@@ -92,10 +92,12 @@ def dense_curves(bed: WheelBed, table: SteadyStateTable, angles_deg: Sequence[fl
       slip_ratio (slip,) by travel speed; drawbar_pull N, side_force N, sinkage m, each (angle, slip).
     """
     slip = np.linspace(-1.0, 0.92, _CURVE_POINTS)
+    # Measured loads differ from point to point: a curve at one load would pass beside them.
     loads = []
     for angle in angles_deg:
         of_angle = table.at_angles((angle,)).test
         loads.append(np.interp(slip, of_angle["slip_ratio"], of_angle["normal_load_N"]))
+    # As the fit itself ran: curves and scores then agree.
     with jax.enable_x64(True):
         angles = np.radians(np.asarray(angles_deg))[:, None]
         test = wheel_test(slip[None, :], angles, np.stack(loads), table.radius, table.width, "travel_speed")

@@ -52,14 +52,17 @@ def measure_overhead(without: Sequence[Effect], full: Sequence[Effect]) -> tuple
                 done = run()
             jax.block_until_ready(done)
             spent.append((clock() - start) / COST.calls)
+    # Halves of one measurement differ by what else the machine did: the error of a verdict on this machine.
     half = COST.repeats // 2
     drift = [abs(min(t[:half]) - min(t[half:])) / min(t) for t in times]
     return min(times[1]) / min(times[0]) - 1.0, max(drift)
 
 
 def _compiled(effects: Sequence[Effect]) -> Callable[[], Any]:
+    # Arrays of the default precision: checks run in float64, users' programs do not.
     pipeline, world = Pipeline(tuple(effects)), jax.tree.map(_real, probe.terrain())
     wheels = 4
+    # A few random rovers over and over: what a rover does changes no instruction, so that more would cost time alone.
     s = probe.states(64, wheels)
     s = {k: np.moveaxis(np.tile(v, (COST.batch // 64, *(1,) * (v.ndim - 1))), 0, -1) for k, v in s.items()}
     memory = jax.tree.map(

@@ -78,7 +78,9 @@ def check_effect(
     if checks[0].passed is False:
         return checks
     on_sensors = "sensor" in effect.ports
+    # Six wheels show an effect that takes the number of wheels, or of steered ones, for granted.
     sizes = (4,) if on_sensors else (4, 6)
+    # In float32 a cancelled difference looks like a null value that is missed.
     with jax.enable_x64(True):
         runs = [_subject(effect, wheels, rovers, seed) for wheels in sizes]
         _try(effect, runs[0])
@@ -88,6 +90,7 @@ def check_effect(
         checks.append(_null(effect, runs))
         checks += _derivatives(effect, runs, seed)
         checks.append(_homogeneity(effect, rovers, seed))
+    # Sensors act once on a whole drive, outside of the step.
     if overhead and not on_sensors:
         cost, noise = measure_overhead(base_list(effect, without=True), base_list(effect))
         checks.append(_cost(cost, noise))
@@ -103,6 +106,7 @@ def base_list(effect: Effect, without: bool = False) -> list[Effect]:
 
 
 def _declaration(effect: Effect) -> Check:
+    # All problems at once: whoever mends one would else meet the next.
     problems = []
     if len(effect.doc) < 10:
         problems.append("no docstring states its equation and source")
@@ -120,6 +124,7 @@ def _subject(effect: Effect, wheels: int, rovers: int, seed: int) -> tuple[_Act,
     """What is probed: a function of the parameters (None: without the effect) and one state, and random states."""
     if "sensor" in effect.ports:
         return functools.partial(act_on_channels, effect), jax.tree.map(jnp.asarray, channel_states(rovers, seed))
+    # One ground for both lists, so that the effect alone tells them apart.
     world = probe.terrain()
 
     def act(values: Mapping[str, Any] | None, s: Any) -> Outputs:
@@ -220,6 +225,7 @@ def _derivatives(effect: Effect, runs: Sequence[tuple[_Act, Any]], seed: int) ->
             out, forward = jax.jvp(act, (numbers, state), toward)
             if not weights:
                 weights.update({k: jnp.asarray(rng.normal(size=v.shape)) for k, v in out.items()})
+            # Random weights: one pass back shows the derivatives of all outputs, and none cancels another.
             _, pull = jax.vjp(act, numbers, state)
             return forward, pull(weights)
 
@@ -268,6 +274,7 @@ def _homogeneity(effect: Effect, rovers: int, seed: int) -> Check:
         for e, m in zip(error, size, strict=True):
             relative = float(np.max(e) / max(float(np.max(m)), 1e-300)) if np.isfinite(e).all() else np.inf
             worst[label][port] = max(worst[label].get(port, 0.0), relative)
+    # One base at a time names the quantity that stands as a number in the function.
     guilty = [(base, port, w) for base in BASES for port, w in worst[base].items() if not w <= TOLERANCES.homogeneity]
     if guilty:
         broken = ", ".join(f"of {BASES[base]} (port {port}, {w:.0e})" for base, port, w in guilty)
@@ -285,6 +292,7 @@ def _watched(effect: Effect, scales: Mapping[str, Rescaling], found: list[tuple[
     """The effect with port functions that also work in other base units and note by how much they then differ."""
 
     def watch(port: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        # Torques are bare arrays; what other ports hand on says its units by its class.
         unit = "N m" if port == "motor_torque" else "own"
 
         def both(ctx: Any, p: Any, x: Any, value: Any) -> Any:

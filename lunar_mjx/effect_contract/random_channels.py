@@ -50,7 +50,9 @@ def channel_states(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     for name, size in _channels().items():
         waves = rng.normal(size=(3, count, 1)), rng.uniform(0.5, 4.0, (3, count, 1)), rng.uniform(0, 7, (3, count, 1))
         out[name] = size * np.sum(waves[0] * np.sin(waves[1] * time + waves[2]), axis=0)
+        # At rest roots and quotients lose their derivatives, as on rovers.
         out[name][0] = 0.0
+    # Attitudes are unit quaternions; the drive at rest has the one without a turn.
     length = np.sqrt(sum(out[f"quaternion_{a}"] ** 2 for a in "wxyz"))
     for a in "wxyz":
         out[f"quaternion_{a}"] = np.where(

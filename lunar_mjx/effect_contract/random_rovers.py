@@ -69,6 +69,7 @@ def rover(wheels: int) -> RoverInfo:
     joints = 3 * wheels
     number, one = jnp.arange(joints), jnp.ones(joints)
     points = Vec3(jnp.asarray([0.5, -0.5]), jnp.asarray([0.3, -0.3]), jnp.asarray([-0.2, 0.05]))
+    # Drive, steer and suspension of each wheel lie side by side.
     group = number % 3
     return RoverInfo(
         RANDOM_ROVERS.radius * jnp.ones(wheels),
@@ -100,6 +101,7 @@ def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
     def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
         return scale * rng.normal(size=(count, moments, *shape))
 
+    # Two columns of wheels, so that a left and a right one differ.
     wheel_places = np.array([[0.5 - i // 2 * (2.0 / wheels), 0.5 - i % 2] for i in range(wheels)])
     # What a state remembers of a place is met by another wheel, as behind each other in a rut.
     lane = np.stack([np.roll(wheel_places, moment, axis=0) for moment in range(moments)])
@@ -128,6 +130,7 @@ def states(count: int, wheels: int, seed: int = 0) -> dict[str, np.ndarray]:
             s[name][still, -1] = 0.0
         s["axle"][still, -1] = [0.0, 1.0, 0.0]
     for i, sinkage in enumerate((0.02, -0.1, 0.0, 0.3)[:count]):
+        # Standing, airborne, just touching and deep: where contact begins and ends.
         s["sinkage"][i, -1] = sinkage
     for i, way in ((4, 1.0), (5, -1.0)):
         if i < count:
@@ -181,6 +184,7 @@ def step(
     pipeline: Pipeline, world: Terrain, values: Values, s: Mapping[str, Any], moment: int, memory: Memory
 ) -> tuple[dict[str, Any], Memory]:
     """Every force, torque and heat flow on one rover at one moment, by all ports from command to heat."""
+    # Random slip to remember: what a few steps from rest leave is much alike on all rovers.
     if "shear_state" in memory:
         memory = {**memory, "shear_state": dict(zip(("slip_x", "slip_y", "direction"), s["slip"][moment], strict=True))}
     ctx = context(pipeline.effects, values, world, s, moment)

@@ -105,6 +105,7 @@ class Model:
                     f"remove {other.name} first",
                 )
         replaced = [i for i, e in enumerate(self.effects) if e.name in added.replaces]
+        # Two effects for one thing would both act: forces would count twice.
         kept = [e for e in self.effects if e.name not in added.replaces]
         # In the place of the first that it replaces: order within a port may matter.
         kept.insert(replaced[0] if replaced else len(kept), added)
@@ -204,6 +205,7 @@ class Model:
                     "names no joint group of the rover",
                     f"use one of {', '.join(groups)}",
                 )
+        # Groups that are left out keep what they have, which may be one value for all joints.
         present = self.parameters[effect.name][key]
         names = [g.name for g in self.rover.groups for _ in g.joints]
         old = present if isinstance(present, tuple) else (present,) * len(names)
@@ -267,6 +269,7 @@ def with_position_gains(model: Model, given: Collection[str]) -> Model:
     A group made for velocity control has none and would stand still whatever the target. Groups in `given` keep theirs.
     """
     gains = {
+        # A velocity gain k in N m s/rad and a position gain r k make a loop whose error falls as exp(-r t).
         group: (_POSITION_RATE * gain[1], gain[1])
         for group, gain in model.gains.items()
         if model.modes.get(group) == "position" and gain[0] == 0.0 and group not in given

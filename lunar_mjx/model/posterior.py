@@ -101,6 +101,7 @@ def read_posterior(
         require_within(path, f"posterior.std of {name}", size, 0.0)
         effect, _, parameter = name.partition(".")
         value = values[effect][parameter]
+        # Found when the file is read: a draw would else be not a number, far from its cause.
         if is_log and np.min(value) <= 0.0:
             raise bad_input(
                 path, f"effects.{name}", value, "has no logarithm, as [posterior] has it", "set log = false"
@@ -111,6 +112,7 @@ def read_posterior(
     whole = np.array(
         [Fields(path, {"correlation": row}, "posterior").vector("correlation", len(names)) for row in rows]
     )
+    # The least eigenvalue may miss zero by the rounding of every row, so that its tolerance grows with their number.
     off = max(np.abs(whole - whole.T).max(), np.abs(np.diag(whole) - 1.0).max())
     if off > _ROUNDING or np.linalg.eigvalsh(0.5 * (whole + whole.T))[0] < -_ROUNDING * len(names):
         remedy = "give a symmetric matrix with ones on its diagonal and no negative eigenvalue"

@@ -36,6 +36,7 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
         image, data = out / f"{_FILES[name]}.png", out / f"{_FILES[name]}.json"
         with styled():
             figure, numbers = FIGURES[name](trainings) if name in NEED_TRAININGS else FIGURES[name]()
+            # Titles and legends of several panels would else run into each other.
             figure.set_layout_engine("constrained")
             FigureCanvasAgg(figure)
             with replacing(image) as part:
@@ -43,6 +44,7 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
             written.append(image)
             if dark:
                 written.append(out / f"{_FILES[name]}_dark.png")
+                # One figure in other colours, so that both pages show the same run.
                 darkened(figure)
                 with replacing(written[-1]) as part:
                     figure.savefig(part, dpi=120, facecolor=figure.get_facecolor())
@@ -67,6 +69,7 @@ def figure_3() -> tuple[Figure, dict]:
         above, below = grid[0][column], grid[1][column]
         above.plot(run.time, run.winding, color=VERMILION, label="winding")
         above.plot(run.time, run.housing, color=BLUE, linestyle="--", label="housing")
+        # The temperature at which the paper cuts the motor off.
         above.axhline(150.0, color=MUTED, linewidth=0.8, linestyle=":")
         below.plot(run.time, run.torque, color=INK, label="actual")
         below.axhline(run.desired, color=MUTED, linestyle="--", label="desired")
@@ -122,6 +125,7 @@ def figure_slope() -> tuple[Figure, dict]:
     axes.plot(slope, slip, "o-", color=BLUE, label="whole rover")
     axes.plot(slope, [r.wheel_slip[:2].mean() for r in runs], "^--", color=VERMILION, label="front wheels")
     axes.plot(slope, [r.wheel_slip[2:].mean() for r in runs], "v:", color=GREEN, label="rear wheels")
+    # What one wheel's drawbar pull promises for a whole rover, as a mark to hold the curve against.
     axes.plot([15.1], [0.40], "*", color=INK, markersize=11, label="drawbar pull of one wheel: 15.1° at 40 %")
     _style(axes, "slope, °", "slip ratio", "VIPER climbing, lunar nominal soil, 0.2 m/s asked")
     axes.legend()
@@ -150,6 +154,7 @@ def _crossing(x: np.ndarray, y: np.ndarray, level: float) -> float | None:
     above = np.flatnonzero(y >= level)
     if not above.size or above[0] == 0:
         return None
+    # Between the last slope below and the first above: the slopes driven are few.
     i = above[0]
     return float(x[i - 1] + (level - y[i - 1]) / (y[i] - y[i - 1]) * (x[i] - x[i - 1]))
 

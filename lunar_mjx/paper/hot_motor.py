@@ -44,6 +44,7 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
       duration: s.
       rover: name or folder of a rover.
     """
+    # Blocked by the parking brake: the torque is asked for and nothing turns, so that all power becomes heat.
     model = make_model(rover, "flat", preset, modes={"drive": "torque"}).add("parking_brake")
     model = model.set("motor", **PRESET_PARAMETERS["paper"]["motor"])
     model = model.set("joint_control", **PRESET_PARAMETERS["paper"]["joint_control"])
@@ -54,11 +55,14 @@ def hot_motor(preset: str, duration: float = 14.0, rover: str = "luvmi_x") -> Ho
     system = build(model)
     drives = len(model.rover.wheels)
     control = jnp.zeros(len(system.joint_names)).at[:drives].set(DESIRED_TORQUE)
+    # Every 20 ms at the usual time step: so well is the moment of the cut-off known.
     steps_per_record = 10
     samples = round(duration / (steps_per_record * model.timestep))
     run = jax.jit(lambda p, s: system.rollout(p, s, jnp.tile(control, (samples, 1)), every=steps_per_record)[1])
     seen = jax.device_get(run(system.params, system.reset(system.params)))
+    # All motors do the same on level ground: the first one stands for them.
     winding = np.asarray(seen.winding_temperature)[:, 0] - ZERO_CELSIUS
+    # The cut-off alone makes a torque that is asked for exactly zero.
     off = np.flatnonzero(np.asarray(seen.joint_torque)[:, 0] == 0.0)
     time = np.asarray(seen.time)
     return HotMotor(

@@ -246,6 +246,7 @@ def figure_4() -> tuple[Figure, dict[str, Any]]:
     axes.grid(False)
     axes.set_title(f"(c) elevation map, {terrain.name}", loc="left", fontsize=10)
     figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), label="height, m")
+    # As many nodes as the surface draws: more cost seconds and are not seen.
     step = max(1, max(heights.shape) // 160)
     part = heights[::step, ::step]
     x, y = np.meshgrid(x0 + cell * step * np.arange(part.shape[1]), y0 + cell * step * np.arange(part.shape[0]))
@@ -279,6 +280,7 @@ def _portrait(name: str, distance: float) -> tuple[np.ndarray, dict[str, Any]]:
     rover = model.rover
     stands = ((rover, _standing(model, (0.0, 0.0, 0.0))),)
     top = float(rover.chassis_points[:, 2].max())
+    # At a height within the rover, so that it stands in the middle of its picture.
     pose = orbit(np.array([0.0, 0.0, 0.3 * top]), distance, 150.0, 18.0)
     light, optics = Light(Sun(200.0, 25.0), film=_FILM), Pinhole(900, 640, 42.0)
     seen = _taken(model.terrain, stands, pose, optics, light, _trodden(stands), detail=True)

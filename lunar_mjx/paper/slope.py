@@ -56,6 +56,7 @@ def slope_runs(
     terrain = stack([inclined(np.deg2rad(s)) for s in slopes_deg])
     terrain = jax.tree.map(jnp.asarray, terrain)
     control = jnp.zeros(len(system.joint_names)).at[: len(model.rover.wheels)].set(rim_speed / radius)
+    # Ten rows a second at the usual time step: the mean over seconds needs no more.
     steps_per_record = 50
     samples = round(duration / (steps_per_record * model.timestep))
 
@@ -64,6 +65,7 @@ def slope_runs(
         return system.rollout(params, system.reset(params), jnp.tile(control, (samples, 1)), every=steps_per_record)[1]
 
     seen = jax.device_get(jax.jit(jax.vmap(run))(terrain))
+    # The end alone: from rest, a rover first sinks in and comes up to speed.
     last = slice(samples - round(average / (steps_per_record * model.timestep)), None)
 
     def mean(values: jax.Array) -> np.ndarray:
@@ -79,6 +81,7 @@ def slope_runs(
             slope_deg=float(s),
             speed=float(speed[i]),
             rim_speed=float(rims[i].mean()),
+            # Wheels that stand would divide by zero; a rover that slides back has a slip above one.
             slip=float(1.0 - speed[i] / max(rims[i].mean(), 1e-9)),
             wheel_slip=slips[i],
             sinkage=sinkage[i],

@@ -64,9 +64,11 @@ def _soft_ground(preset: str, duration: float, rover: str, torque: float) -> lis
     model = make_model(rover, "flat", preset, modes={"drive": "torque"})
     model = model.add("hard_surface").add("soil_gradient")
     system = build(model)
+    # Twenty rows a second: paths are smooth.
     every, drives = 25, len(model.rover.wheels)
     per_second = round(1.0 / (every * model.timestep))
     push = jnp.zeros(len(system.joint_names)).at[:drives].set(torque)
+    # Three seconds without torque first, in which the wheels sink in: else the drop would be part of the path.
     controls = jnp.concatenate(
         [jnp.zeros((3 * per_second, push.size)), jnp.tile(push, (round(duration * per_second), 1))]
     )

@@ -80,6 +80,7 @@ def _has_episodes(record: dict[str, Any]) -> bool:
 def _records(data: dict[str, Any]) -> Iterable[tuple[str, dict[str, Any]]]:
     """Name and record of every run in a file of one of the kinds."""
     if "seeds" in data:  # many rovers, several seeds
+        # Kept records of many rovers name no training each: what they have alike is said once.
         yield from ((f"TD3, {data['rover']}, {data['train']['envs']:,} at once", r) for r in data["seeds"])
     elif "runs" in data:  # the paper's own task
         yield from ((name, record) for name, runs in data["runs"].items() for record in runs)
@@ -92,6 +93,7 @@ def figure_6(paths: Sequence[str | Path]) -> tuple[Figure, dict[str, Any]]:
     step, with success on unseen ground as dots."""
     groups = read_trainings(paths)
     records = [r for runs in groups.values() for r in runs]
+    # By episode only if all can be drawn so: two axes in one figure cannot be compared.
     episodes = all(_has_episodes(r) for r in records)
     figure = Figure(figsize=(9.5, 3.8))
     left, right = figure.subplots(1, 2)
@@ -124,6 +126,7 @@ def _by_step(panels: Sequence[Axes], runs: Sequence[dict[str, Any]], label: str,
             label=label if i == 0 else None,
         )
         right.plot(steps, [100.0 * r["success"] for r in rows], color=colour, linestyle=line, linewidth=1.0)
+        # Scores are made every few seconds and not in every epoch, so that they are dots and no line.
         unseen = run.get("unseen") or []
         right.plot(
             [s["steps"] for s in unseen],

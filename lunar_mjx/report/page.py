@@ -125,6 +125,7 @@ def packed(text: str) -> str:
 
 def _json(value: str) -> str:
     """JSON that cannot leave its script element."""
+    # An HTML parser ends a script at </script> wherever it stands, also within a text of JSON.
     return value.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
@@ -183,6 +184,7 @@ def _block(block: Block, figures: list[str]) -> dict[str, Any]:
 
 
 def _placed(figure: go.Figure, figures: list[str], least: int = 0) -> dict[str, int]:
+    # Figures stand in the page's script, in one list: their place in it is what a block of HTML refers to.
     figures.append(_json(str(figure.to_json())))
     # Plotly's own height where a figure states none.
     return {"height": figure.layout.height or 450, "least": least, "index": len(figures) - 1}

@@ -21,6 +21,7 @@ _LINE_EVERY = 5.0
 def console_progress(console: Console | None = None) -> Iterator[Reporter]:
     """A reporter to standard error: a bar on a terminal, else a line at most every five seconds and at each stage."""
     console = console or Console(stderr=True)
+    # A file or another program would get the bar's control characters, and one line for each of its pictures.
     if not console.is_terminal:
         yield _lines(console)
         return

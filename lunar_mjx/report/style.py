@@ -162,6 +162,7 @@ def finish(figure: go.Figure, height: int, **layout: Any) -> go.Figure:
         # in a row they would cover the legend's last words; in the right margin they cover nothing
         modebar={"orientation": "v"},
     )
+    # After the common layout, whose settings a figure's own replace.
     figure.update_layout(**layout)
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis)

@@ -79,6 +79,7 @@ class Pilot:
 
     def press(self, key: str) -> None:
         """Takes one press that changes what is asked for by a notch, until it is changed again."""
+        # In a window a press is all that is heard: a brake that had to be held could not be.
         if key == "brake":
             self.throttle, self.wheel = 0.0, 0.0
         elif key in ("forward", "back"):
@@ -89,6 +90,7 @@ class Pilot:
     def control(self, interval: float) -> np.ndarray:
         """Targets (joint,) of all motors after `interval` s more."""
         wanted = 0.0 if self.braking else self.throttle * self.top_speed
+        # A brake that were no stronger than letting go would not feel like one.
         most = HANDLING.acceleration * interval * (3.0 if self.braking else 1.0)
         self.speed += float(np.clip(wanted - self.speed, -most, most))
         self.turn += float(
@@ -123,4 +125,5 @@ def _notched(value: float, sign: float) -> float:
 
 def _span(low: float, high: float) -> float:
     span = min(-low, high)
+    # Short of the stop: a motor that pushes against it heats up and turns nothing.
     return 0.9 * span if 0.0 < span < math.inf else HANDLING.span

@@ -114,6 +114,7 @@ class PolicyDrive:
     def advance(self, duration: float) -> float:
         """Drives on by whole control intervals; what is left over is shown between two states. Returns s driven."""
         interval = self._env.control_interval
+        # Capped, or a pause of the machine would be followed by a burst of steps.
         self._behind = min(self._behind + duration, (POLICY_PACE.most_steps + 1) * interval)
         self._told -= duration
         if self._told < 0.0:

@@ -76,6 +76,7 @@ class Replay:
         self, model: Model, title: str, measured: Course, predicted: Sequence[Course], traces: Sequence[Trace]
     ) -> None:
         self.model, self.pilot, self.rate, self.path = model, Onlooker(), 1.0, 0.0
+        # Evenly, whatever the log's own times: the page plays one picture after another.
         time = np.linspace(
             measured.time[0], measured.time[-1], min(REPLAY_SIZES.frames, max(2, 10 * len(measured.time)))
         )
@@ -168,5 +169,5 @@ def _packed(values: np.ndarray) -> str:
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
-    """Four digits and a dash for what is missing."""
+    """Numbers as JSON holds them, in five digits; None where one is missing."""
     return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, float)]

@@ -65,6 +65,7 @@ def _shape(mj: mujoco.MjModel, i: int) -> dict[str, Any]:
     kind = _SHAPES[int(mj.geom_type[i])]
     size = mj.geom_size[i].tolist()
     if mj.geom_type[i] == mujoco.mjtGeom.mjGEOM_SPHERE:
+        # MuJoCo gives a sphere one size; the page draws it as the ellipsoid that it is, with three.
         size = size[:1] * 3
     shape = {
         "kind": kind,
@@ -93,6 +94,7 @@ def ground_scene(terrain: Terrain, x: float, y: float) -> dict[str, Any]:
     rows, cols = np.asarray(field.heights).shape
     origin, cell = np.array([float(field.x0), float(field.y0)]), float(field.cell)
     end = origin + cell * np.array([cols - 1, rows - 1])
+    # A rover may have left the terrain: the nearest ground is drawn then.
     middle = np.clip([x, y], origin, end)
     near = cut(terrain, middle - DRAWN_GROUND.near, middle + DRAWN_GROUND.near, DRAWN_GROUND.nodes)
     return {
@@ -113,6 +115,7 @@ def _rocks(terrain: Terrain, near: Patch) -> list[list[float]]:
         return []
     centers, (axes, turns) = np.asarray(terrain.rocks.centers, float), semi_axes(terrain.rocks)
     low, high = np.asarray(near.low), np.asarray(near.high)
+    # The last rock of every terrain is a dummy without size (see `build_rocks`).
     seen = (axes[:, 0] > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
     vectors = (turns * axes[:, None, :]).swapaxes(1, 2).reshape(-1, 9)
     return np.column_stack([centers, vectors])[seen].round(4).tolist()

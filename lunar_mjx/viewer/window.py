@@ -82,6 +82,7 @@ def show_window(drive: LiveDrive, sun: Sun) -> None:
 
     data.qpos[:] = drive.qpos
     mujoco.mj_forward(model, data)
+    # MuJoCo keeps its thread to itself; it is told from the others by having come later.
     before = set(threading.enumerate())
     try:
         window = mujoco.viewer.launch_passive(model, data, key_callback=press, show_left_ui=False, show_right_ui=False)
@@ -110,6 +111,7 @@ def _look(window: Any, model: mujoco.MjModel, drive: LiveDrive) -> None:
         window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
         window.cam.trackbodyid = model.body(rover.chassis).id
         window.cam.distance = 4.0 * float(np.abs(rover.chassis_points).max()) + 1.0
+        # From behind and aside, so that wheels of both sides and the ground ahead are seen.
         window.cam.azimuth, window.cam.elevation = 35.0, -18.0
         window.opt.flags[mujoco.mjtVisFlag.mjVIS_CAMERA] = False
 

@@ -40,6 +40,7 @@ def writer(path: Path, fps: int) -> Iterator[Sink]:
     pictures: list[Image.Image] = []
     yield lambda picture: pictures.append(Image.fromarray(picture))
     if pictures:
+        # Pillow takes a quality for WebP alone; GIF has a palette in its place.
         options: dict[str, Any] = {"quality": 80} if path.suffix.lower() == ".webp" else {}
         with replacing(path) as part:
             pictures[0].save(

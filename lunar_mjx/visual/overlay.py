@@ -31,6 +31,7 @@ COLOURS = OverlayColours()
 def wheel_colour(corner: str) -> tuple[int, int, int]:
     """RGB of a wheel's line on a dark ground: sides differ in colour as in the plots, rear wheels are dimmer."""
     colour = WHEEL_STYLES.get(corner, (MUTED,))[0]
+    # Wheels of one side share a colour; how bright it is tells front from rear.
     bright = 0.62 if corner in ("lr", "rr") else 1.0
     # Brighter than in the plots, whose colours are made for white paper.
     red, green, blue = (round(bright * min(255, int(colour[i : i + 2], 16) + 60)) for i in (1, 3, 5))
@@ -52,6 +53,7 @@ class Overlay:
         self._slip = drive.per_wheel("wheel_{}_slip_ratio")
         self._sinkage = 1e3 * drive.per_wheel("wheel_{}_sinkage_m").max(axis=1)
         self._hot = drive.per_motor("winding_{}_temperature_degC").max(axis=1)
+        # Drawn once: only the line that marks the time differs from picture to picture.
         self._strip, self._frames = self._draw_strip()
         self._map = MapInset(drive, round(0.30 * size[1])) if with_map else None
 
@@ -108,6 +110,7 @@ class Overlay:
             (4.0 * self._line, 0.49 * width, top, bottom),
             (0.49 * width + 5.0 * self._line, width - 14, top, bottom),
         ]
+        # Slip of a wheel at rest is not a number, and would break its line.
         slip = np.clip(np.nan_to_num(self._slip), -1.0, 1.0)
         # A few spikes, as at a start, would flatten all else.
         low, high = min(0.0, float(np.percentile(slip, 1))), max(0.5, float(np.percentile(slip, 99)))
@@ -176,6 +179,7 @@ class MapInset:
 
     def draw(self, row: int) -> Image.Image:
         """The map at a row of the drive."""
+        # The ground, the path and the frame are the same in every picture.
         image = self.ground.base.copy()
         draw = ImageDraw.Draw(image)
         if row:

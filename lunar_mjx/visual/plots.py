@@ -162,6 +162,7 @@ def drive_summary(drive: RecordedDrive) -> Figure:
     """The path on shaded relief, and over time slope, slip, sinkage, temperature and power."""
     figure = Figure(figsize=(13.0, 7.4), layout="constrained")
     grid = figure.add_gridspec(5, 2, width_ratios=(1.15, 1.0))
+    # The rover is drawn where it ends, and must not stick out of the map.
     reach = float(np.abs(np.asarray(drive.model.rover.chassis_points)[:, :2]).max())
     low, high = bounds(drive.position[:, :2], 0.08, LAYOUT.slimmest, reach)
     slim = float((high - low)[1] / (high - low)[0]) < LAYOUT.slim
@@ -296,6 +297,7 @@ def _temperature(axes: Axes, drive: RecordedDrive) -> None:
 
 
 def _power(axes: Axes, drive: RecordedDrive) -> None:
+    # The sum over all motors: which of them takes how much is in the drive's table.
     power = drive.power
     axes.plot(drive.time, power, color=INK, linewidth=1.1)
     axes.axhline(0.0, color=RULE, linewidth=0.8)
@@ -327,6 +329,7 @@ def terrain_preview(terrain: Terrain) -> Figure:
     middle.set_xlabel("east, m")
     middle.set_title(f"slope over {cell * step:.3g} m", loc="left", fontsize=9)
     figure.colorbar(image, ax=middle, label="slope, °", shrink=0.8)
+    # A cumulative curve needs no bins, whose width would change what it shows.
     ordered = np.sort(slope.ravel())
     right.plot(ordered, 100.0 * (1.0 - np.arange(ordered.size) / ordered.size), color=INK)
     style(right, "ground at least as steep, %", "slope, °")

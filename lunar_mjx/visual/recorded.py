@@ -81,6 +81,7 @@ class RecordedDrive:
         """Slope of the ground under the chassis, (time, 2) deg: along the heading (positive uphill), up to the left."""
         x, y = self.position[:, 0], self.position[:, 1]
         east, north = (np.asarray(v, float) for v in gradient(self.model.terrain.field, x, y))
+        # The terrain's gradient is east and north; a driver asks for along and across.
         yaw = np.radians(self.columns(["yaw_deg"])[:, 0])
         along, across = np.cos(yaw) * east + np.sin(yaw) * north, np.cos(yaw) * north - np.sin(yaw) * east
         return np.degrees(np.arctan(np.stack([along, across], axis=-1)))

@@ -29,6 +29,7 @@ MODES: dict[int, tuple[Mode, str]] = {
 
 
 class _Part(BaseModel):
+    # A reader must not pass over a field that it does not know: it may change what an action means.
     model_config = ConfigDict(extra="forbid")
 
 
@@ -167,6 +168,7 @@ def contract_of(policy: Policy, env: Any, source: str, sha256: dict[str, str]) -
         "normalisation": _normalisation(policy),
     }
     if not isinstance(env, NavigationEnv):
+        # Of a user's own environment nothing is known but sizes: its numbers have numbers for names.
         size, actions = policy.network["obs"], policy.network["actions"]
         names = [str(i) for i in range(size)]
         block = Block(name="obs", about="As the environment gives it.", start=0, names=names, units=["1"] * size)
@@ -223,6 +225,7 @@ def _picture(env: NavigationEnv, size: int) -> Picture:
     return Picture(
         rows=c.camera_height,
         columns=c.camera_width,
+        # A depth picture has one number a pixel, a colour picture three.
         colours=size // (c.camera_height * c.camera_width),
         fovy_deg=c.camera_fovy_deg,
         pitch_deg=c.camera_pitch_deg,

@@ -90,6 +90,7 @@ def drives(env: NavigationEnv, params: Any, agent: Agent, rovers: int, frames: i
             "terminations": after.terminated,
             "truncations": after.truncated,
         }
+        # An episode's last observation is the true one, not the first of the next: a learner takes its value from it.
         ends = {"observations": after.final_obs, **_seen(env, after)}
         return new, {**told, "after": ends, "begun": {"observations": new.obs, **_seen(env, new)}}
 
@@ -98,6 +99,7 @@ def drives(env: NavigationEnv, params: Any, agent: Agent, rovers: int, frames: i
     state = jax.jit(env.reset)(params, split_keys(key_reset, rovers))
     first = jax.device_get({"observations": state.obs, **_seen(env, state)})
     open_ones = [_Open({name: value[i] for name, value in first.items()}) for i in range(rovers)]
+    # Whole steps of all rovers, so that none of them has fewer frames than the others.
     left = -(-frames // rovers)
     for number in range(-(-left // _PIECE)):
         keys = jax.random.split(jax.random.fold_in(key, number), _PIECE)
@@ -139,6 +141,7 @@ class _Open:
 
     def cut(self) -> Iterator[Episode]:
         """The episode that is not over, cut off; nothing where none has begun."""
+        # A rover whose episode ended with the last step has begun another one, in which nothing was done.
         if self._rows:
             episode = self._whole()
             episode["truncations"][-1] = True
@@ -230,6 +233,7 @@ def write_dataset(
                             if key != "infos":
                                 parent.create_dataset(key, data=value)
                     count, steps = count + 1, steps + length
+                    # A full disk is noticed at the first write that fails, not after hours of driving.
                     if sink.refused:
                         break
             sink.check()
@@ -291,6 +295,7 @@ def export_dataset(
         raise bad_input("export", "environment", type(env).__name__, "has no rovers", "export drives of navigation")
     begin = time.monotonic()
     device = jax.devices()[0].device_kind
+    # What it takes to drive the same episodes again.
     whole = {**about, "seed": seed, "rovers": rovers, "device": device}
     count, steps = write_dataset(drives(env, params, agent, rovers, frames, seed), env, folder, name, whole)
     spent = time.monotonic() - begin

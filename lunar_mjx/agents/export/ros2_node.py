@@ -128,6 +128,7 @@ class Driver:
     def __init__(self, policy: Any, timeout_s: float):
         self.policy, self.contract, self.timeout = policy, policy.contract, timeout_s
         self.blocks = {b["name"]: len(b["names"]) for b in self.contract["observations"]}
+        # A rover's own software computes such blocks: a node knows no height maps.
         self.foreign = [name for name in self.blocks if not hasattr(self, "block_" + name)]
         self.inputs: dict[str, Any] = {}
         self.begin()
@@ -152,6 +153,7 @@ class Driver:
         """Names of inputs that are missing or too old; a goal does not age."""
         wanted = TOLD + tuple(self.foreign)
         ages = {k: now - self.inputs[k][1] if k in self.inputs else math.inf for k in wanted}
+        # A goal is sent once, and holds until there is another.
         if "goal" in self.inputs:
             ages["goal"] = 0.0
         return [name for name, age in ages.items() if age > self.timeout]

@@ -44,6 +44,7 @@ def begin_with(learner: Any, state: Any, source: str) -> Any:
         out[tuple(slice(n) for n in np.shape(old))] = old
         return out
 
+    # On the host: devices may share the state among them, and arrays of other shapes are put together here.
     params = jax.device_get(state.agent.params.policy)["params"]
     known = policy.params["params"]
     # Weights of new observations are zero: whatever they say, the policy does as before.
@@ -94,6 +95,7 @@ def _check(learner: Any, policy: Policy, source: str) -> None:
     ):
         if theirs != ours:
             raise refuse(f"has {name} = {theirs}, and the training {ours}", "give a policy of a training like this one")
+    # Of environments that say no names of observations, their number has to do.
     fits, said = network["obs"] == env.observation_size, (network["obs"], env.observation_size)
     if isinstance(env, NavigationEnv) and policy.environment.get("name") == "navigation":
         task, rover = taught_in(policy, f"train: {FIELD} {source}")

@@ -132,8 +132,8 @@ class PPO:
         )
         self.networks = PPONetworks(self.network, self.value, self.distribution)
         self.optimiser = optax.chain(
-            # As a hyperparameter in the state: the rate follows the divergence from update to update.
             optax.clip_by_global_norm(c.max_gradient),
+            # As a hyperparameter in the state: the rate follows the divergence from update to update.
             optax.inject_hyperparams(optax.adam)(learning_rate=c.rate),
         )
 

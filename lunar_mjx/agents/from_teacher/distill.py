@@ -148,6 +148,7 @@ class Distill:
           state: of the student. obs: its own, normalised. privileged: what the teacher sees, as the environment gives
             it. iterations: steps of every environment so far.
         """
+        # In every state, whoever drove there: what to do after own mistakes is the lesson (DAgger).
         taught = self.teacher.act(privileged).astype(obs.dtype)
         rank = (jnp.arange(obs.shape[0]) + 0.5) / obs.shape[0]
         # Whole environments and not single steps: a teacher that takes over now and then hides where mistakes lead.
@@ -214,6 +215,7 @@ def check_teacher(name: str, teacher: Policy, env: Any) -> None:
         if rover is not None and rover != env.model.rover.name:
             problem = f"is not the {env.model.rover.name} that is to learn"
             raise bad_input(source, "rover", rover, problem, f"give a teacher of {env.model.rover.name}")
+        # An action of as many numbers may mean other speeds, which a student would copy without a word.
         for field in DRIVING:
             theirs, ours = getattr(task, field), getattr(env.config, field)
             if theirs != ours:

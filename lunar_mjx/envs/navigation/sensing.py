@@ -54,6 +54,7 @@ class Odometry:
 
 def odometry_at_start(keys: Float[Array, "env 2"], dtype: Any) -> Odometry:
     """Odometry at the beginning of episodes, from raw random keys."""
+    # Another direction in every episode: a policy could learn to correct one that is always the same.
     bearing = jax.vmap(lambda k: jax.random.uniform(k, (), dtype, -jnp.pi, jnp.pi))(keys)
     astray = jnp.stack([jnp.cos(bearing), jnp.sin(bearing)], axis=-1)
     return Odometry(jnp.zeros_like(astray), astray)
@@ -76,6 +77,7 @@ def in_sight(
       terrain: one for all. eye: the sensors, m. place: x, y and height of the places, m.
       reach: by which rocks are widened, m.
     """
+    # Neither end counts: the sensor stands on its own mast, and a place does not hide itself.
     share = jnp.arange(1, LOOKS + 1) / (LOOKS + 1)
     x, y, line = (
         a[:, None, None] + share * (b[..., None] - a[:, None, None])
