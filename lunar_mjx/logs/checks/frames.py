@@ -48,6 +48,14 @@ class FrameLimits:
     """Standard deviation of the IMU's mounting about z, deg, from which its yaw tells no heading."""
     level: float = 2.0
     """deg of pitch up to which no rover slides back on its own."""
+    reversed_force: float = 150.0
+    """deg between measured and expected specific force from which its sign is reversed, and not its axes."""
+    steered: float = 0.05
+    """rad by which a joint turns that steers: zeros of encoders are off by less."""
+    turning: float = 0.05
+    """rad/s of a wheel that drives: of a slower one, noise may tell the direction."""
+    straight: float = 20.0
+    """deg of heading within a window up to which its course has one direction."""
 
 
 FRAME_LIMITS = FrameLimits()
@@ -177,7 +185,7 @@ def _gravity(log: Log) -> list[Finding]:
     angle = float(np.degrees(np.arccos(np.clip(force @ expected / max(size, 1e-12) / np.linalg.norm(expected), -1, 1))))
     shown = ", ".join(f"{v:.3g}" for v in force)
     # First the sign: a reversed axis would also fail the size's and the axes' tests.
-    if angle > 150.0:
+    if angle > FRAME_LIMITS.reversed_force:
         return [
             _finding(
                 log,
@@ -344,9 +352,9 @@ SPEED, STEER = "joint_{}_drive_speed_rad_s", "joint_{}_steer_angle_rad"
 
 
 def _steers(log: Log) -> bool:
-    """Whether any joint is steered by more than 0.05 rad."""
+    """Whether any joint is steered by more than `FRAME_LIMITS.steered`."""
     names = [n for n in log.channel_names if "_steer_angle_rad" in n]
-    return any(s is not None and float(np.abs(s[1]).max()) > 0.05 for s in map(log.channel, names))
+    return any(s is not None and float(np.abs(s[1]).max()) > FRAME_LIMITS.steered for s in map(log.channel, names))
 
 
 def _turn_rate(log: Log) -> tuple[str, str] | None:
@@ -442,7 +450,8 @@ def _course(log: Log) -> list[Finding]:
     turned = np.abs(increments(log, "yaw_deg", windows))
     # Backing up, course and heading point opposite ways by right.
     moved = np.hypot(east, north) * np.sign(spin)
-    keep = (np.abs(moved) > max(20.0 * sigma(log, names[0]), 1e-3)) & (np.abs(spin) > 0.05) & (turned < 20.0)
+    keep = np.abs(moved) > max(20.0 * sigma(log, names[0]), 1e-3)
+    keep &= (np.abs(spin) > FRAME_LIMITS.turning) & (turned < FRAME_LIMITS.straight)
     heading = np.radians(means(log, "yaw_deg", windows))
     along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
     # Angle of the course off the heading, in the direction that the wheels drive.

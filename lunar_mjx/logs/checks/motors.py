@@ -29,6 +29,16 @@ class MotorLimits:
     # pitch beyond which it may.
     against: float = -0.8
     downhill: float = 2.0
+    follows: float = 0.95
+    """Cosine between a joint and its command from which the factor between them is one of units."""
+    least_factor: float = 0.01
+    """Factor below which a joint was held: it did not follow its command in any unit."""
+    least_steer: float = 0.02
+    """rad by which a joint that steers or gives way turns within a window: a held one only by its rounding."""
+    heat_every: float = 0.5
+    """s between looks at temperatures: heat moves in seconds."""
+    heat_least: float = 20.0
+    """s of temperatures that tell whether a winding warms by its current: about two of its time constants."""
 
 
 MOTOR_LIMITS = MotorLimits()
@@ -67,7 +77,7 @@ def _against(log: Log) -> list[Finding]:
         i, w = means(log, name, windows), means(log, speed[c], windows)
         pitch = means(log, "pitch_deg", windows) if span(log, ("pitch_deg",)) == limits else np.zeros(len(i))
         # Downhill a motor brakes, and its current has the other sign by right.
-        keep = (np.abs(w) > 0.05) & (np.sign(w) * pitch < MOTOR_LIMITS.downhill)
+        keep = (np.abs(w) > FRAME_LIMITS.turning) & (np.sign(w) * pitch < MOTOR_LIMITS.downhill)
         if keep.sum() < 8:
             continue
         cosine = float(i[keep] @ w[keep] / max(np.linalg.norm(i[keep]) * np.linalg.norm(w[keep]), 1e-12))
@@ -98,9 +108,8 @@ def _follows(log: Log, kind: str, quantity: str) -> list[Finding]:
         # one command tells neither sign nor unit: a controller may scale it down, or trade the sides' speeds for a turn
         if pair is None or len(np.unique(mine[mine != 0.0])) < 2:
             continue
-        if pair.cosine > 0.95 and (
-            pair.factor > MOTOR_LIMITS.many or 0.01 < pair.factor < 1.0 / (4.0 * MOTOR_LIMITS.many)
-        ):
+        slow = MOTOR_LIMITS.least_factor < pair.factor < 1.0 / (4.0 * MOTOR_LIMITS.many)
+        if pair.cosine > MOTOR_LIMITS.follows and (pair.factor > MOTOR_LIMITS.many or slow):
             findings.append(
                 _finding(
                     log,
@@ -179,8 +188,7 @@ def _angles(log: Log, kind: str) -> list[Finding]:
     findings = []
     for c, angle in angles.items():
         pair = rate_agreement(log, angle, speeds[c]) if c in speeds else None
-        # A steering joint that is held moves less than its rounding.
-        if pair is None or (kind != "drive" and pair.reference < 0.02):
+        if pair is None or (kind != "drive" and pair.reference < MOTOR_LIMITS.least_steer):
             continue
         if abs(pair.cosine) > FRAME_LIMITS.alike and abs(pair.factor - 1.0) > FRAME_LIMITS.factor_tolerance:
             findings.append(
@@ -334,12 +342,10 @@ def _heat(log: Log, kind: str) -> list[Finding]:
         limits = span(log, (winding[c], housing[c], current[c]))
         if limits is None:
             continue
-        # Twice a second: heat moves in seconds.
-        time = np.arange(*limits, 0.5)
-        power = _average(known_at(log, current[c], time), 0.5 / 10.0)
+        time = np.arange(*limits, MOTOR_LIMITS.heat_every)
+        power = _average(known_at(log, current[c], time), MOTOR_LIMITS.heat_every / 10.0)
         apart = known_at(log, winding[c], time) - known_at(log, housing[c], time)
-        # Twenty seconds, about two time constants of a winding.
-        if len(time) < 40:
+        if len(time) < MOTOR_LIMITS.heat_least / MOTOR_LIMITS.heat_every:
             continue
         rise, cosine = _slope(power, apart)
         if cosine < -0.8 and abs(rise) * np.ptp(power) > max(5.0, 8.0 * sigma(log, winding[c])):

@@ -37,6 +37,8 @@ class SteadyLimits:
     """Scatter of the side force over that of the pull at zero slip angle from which the two are swapped."""
     at_limit: float = 0.05
     """Share of the rows at one extreme value from which a channel is saturated."""
+    told_scatter: float = 1.3
+    """Scatter of replicates over the stated noise from which a sure excess is told, but not refused."""
     over_others: float = 4.0
     """Rows at the extreme value over those at the most frequent other one: instruments of few digits repeat all."""
 
@@ -287,7 +289,7 @@ def _replicates(log: SteadyLog) -> list[Finding]:
                     f"stated noise ({freedom} degrees of freedom); state what the replicates show",
                 )
             )
-        elif high and ratio > 1.3:
+        elif high and ratio > STEADY_LIMITS.told_scatter:
             findings.append(
                 _finding(
                     log,

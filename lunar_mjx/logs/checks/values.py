@@ -29,6 +29,8 @@ class ValueLimits:
     """Share of samples exactly at the extreme value; with noise of two quanta or more a good channel has a few."""
     far_from_ambient: float = 200.0
     """K between a motor at the log's start and its surroundings: 273 is kelvin for Celsius, no motor is that hot."""
+    hottest_around: float = 150.0
+    """degC of surroundings, above which they look like kelvin themselves: lunar ground at noon has some 120."""
     by_chance: float = 2.5
     """Standard deviations by which a share of few cells may exceed `CLOCK_LIMITS.lost_share` by chance."""
     evenly: float = 0.8
@@ -114,7 +116,8 @@ def _kelvin(log: Log, values: np.ndarray) -> str:
     ambient = environment_value(log, "ambient_temperature_degC")
     # At the start motors have their surroundings' temperature; later they may be hot.
     start = float(np.median(values[:5]))
-    if ambient is not None and ambient < 150.0 and abs(start - ambient) > VALUE_LIMITS.far_from_ambient:
+    sound = ambient is not None and ambient < VALUE_LIMITS.hottest_around
+    if ambient is not None and sound and abs(start - ambient) > VALUE_LIMITS.far_from_ambient:
         hint = " (looks like kelvin)" if abs(start - ZERO_CELSIUS - ambient) < 100.0 else ""
         return (
             f"starts at {start:.4g} degC where the surroundings have {ambient:g} degC{hint}; give degrees Celsius, "
