@@ -34,8 +34,9 @@ from typing import Any
 
 import harness
 import pandas
-from harness import EXPERIMENTS, FINAL, KEPT, Clock, Setup, in_time, save, say, show, training_of
+from harness import EXPERIMENTS, KEPT, Clock, Setup, in_time, save, say, show, training_of
 
+from lunar_mjx.agents import FINAL_SEED, UNSEEN_PLACES
 from lunar_mjx.agents.configs import override
 from lunar_mjx.agents.evaluate import Judge
 from lunar_mjx.agents.train import RunConfig
@@ -82,7 +83,7 @@ def last_policies(
         setup.env.params = params
         result = setup.train(RunConfig(int(args.steps), seed, None, math.inf, quiet=True))
         policy, last = setup.policy(result.state), result.rows[-1]
-        scores = {test: judge(where, policy, FINAL)["policy"] for test, (judge, where) in tests.items()}
+        scores = {test: judge(where, policy, FINAL_SEED)["policy"] for test, (judge, where) in tests.items()}
         say(f"seed {seed}, trained {name}, {last['elapsed_s']:.0f} s; tested")
         show(scores)
         about = {"seed": seed, "arm": name, "steps": last["steps"], "train_s": last["elapsed_s"]}
@@ -157,7 +158,7 @@ def posterior(args: argparse.Namespace, clock: Clock) -> None:
     unseen, judge = hidden(nominal), uniform.judge(args.episodes)
     if ground := training.unseen.get("terrain"):
         unseen = unseen.replace(terrain=world(ground.removeprefix(PREFIX)) if ground.startswith(PREFIX) else ground)
-    test = place(unseen, STILL, seed=uniform.env.config.place_seed + 7919)
+    test = place(unseen, STILL, seed=uniform.env.config.place_seed + UNSEEN_PLACES)
     compile_s = max(harness.in_threads(lambda: uniform.compile(judge), own.compile))
     say(f"compiled in {compile_s:.0f} s, {clock.spent:.0f} s since the beginning")
     arms = {

@@ -35,8 +35,6 @@ KEPT = ROOT / "benchmarks" / "rl"
 """Where the records lie that the documentation quotes."""
 COMMIT, TREE = commit(), tree()
 """As the process began: files may change while it runs."""
-FINAL, DURING = 54321, 12345
-"""Seeds of the episodes of final scores, and of scores during training."""
 AHEAD = ("height_scan", "far_scan", "plan")
 """Blocks of observations that come from what the rover sees ahead."""
 EXPERIMENTS: dict[str, dict[str, Any]] = tomllib.loads((KEPT / "experiments.toml").read_text(encoding="utf-8"))

@@ -30,8 +30,9 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import COMMIT, DURING, FINAL, KEPT, Clock, Judge, alone_on, ends, reached, save, say, training_of, write
+from harness import COMMIT, KEPT, Clock, Judge, alone_on, ends, reached, save, say, training_of, write
 
+from lunar_mjx.agents import CHOOSING_SEED, FINAL_SEED
 from lunar_mjx.agents.evaluate import evaluate, success_text
 from lunar_mjx.agents.play import open_agent
 from lunar_mjx.agents.policy import policy_of_sb3, save_policy
@@ -81,7 +82,7 @@ class Scorer:
         if not steps:  # nothing is learnt yet, and the judge is being compiled
             return
         self.ready.result()
-        self.rows.append({"steps": int(steps), **self.score(DURING)})
+        self.rows.append({"steps": int(steps), **self.score(CHOOSING_SEED)})
         self.keep(self.record())
         if self.clock.left < 0.0:
             raise OutOfTime
@@ -146,7 +147,7 @@ def brax(args: argparse.Namespace, clock: Clock) -> None:
         scorer = Scorer(args, env, unseen, Clock(clock.left / (2 - i) - 8.0), keep)
         try:
             learn(name, settings, scorer)
-            keep({**scorer.record(), "final": scorer.score(FINAL)})
+            keep({**scorer.record(), "final": scorer.score(FINAL_SEED)})
             say(f"{name}: {success_text(runs[name]['final'])} after {scorer.rows[-1]['steps']:,} steps")
         except Exception as error:  # the other one still runs
             keep({**scorer.record(), "error": f"{type(error).__name__}: {error}"})
@@ -205,7 +206,7 @@ def sb3(args: argparse.Namespace, clock: Clock) -> None:
     model.learn(int(args.steps), callback=Recorder())
     keep()
     own, agent, unseen = open_agent(str(path))
-    record["final"] = evaluate(own, agent, args.episodes, FINAL, unseen_params(own, unseen)).record()
+    record["final"] = evaluate(own, agent, args.episodes, FINAL_SEED, unseen_params(own, unseen)).record()
     keep()
     say(f"{record['steps']:,} steps, {len(record['episodes'])} episodes in {record['cpu_s'] / 60:.0f} min of CPU time")
     say(f"its policy on unseen ground: {success_text(record['final'])} of {args.episodes}, {ends(record['final'])}")

@@ -26,9 +26,10 @@ from typing import Any
 import harness
 import jax
 import numpy as np
-from harness import COMMIT, DURING, EXPERIMENTS, FINAL, KEPT, TREE, Clock, Judge, Setup, read, say, show, when
+from harness import COMMIT, EXPERIMENTS, KEPT, TREE, Clock, Judge, Setup, read, say, show, when
 from rates import Driven
 
+from lunar_mjx.agents import CHOOSING_SEED, FINAL_SEED
 from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.evaluate import success_text
 from lunar_mjx.agents.policy import policy_of, save_policy
@@ -106,10 +107,10 @@ class Trials:
         def look(state: Any, row: dict[str, Any]) -> float:
             nonlocal best
             policy = setup.policy(state)
-            found = self.during(unseen, policy, DURING)
-            score, chosen = {**when(row), "seed": DURING, "rows": found}, found[self.own]
+            found = self.during(unseen, policy, CHOOSING_SEED)
+            score, chosen = {**when(row), "seed": CHOOSING_SEED, "rows": found}, found[self.own]
             if self.choose_by == "seen":
-                score["train"] = chosen = self.during(setup.env.params, policy, DURING)[self.own]
+                score["train"] = chosen = self.during(setup.env.params, policy, CHOOSING_SEED)[self.own]
             good = row["steps"] if self.choose_by == "last" else chosen["success"]
             run["scores"].append(score)
             self.store(seed, state, row, found[self.own], "_last")
@@ -138,8 +139,8 @@ class Trials:
         elif not run["scores"] or run["scores"][-1]["steps"] < last["steps"]:
             look(result.state, last)
         _, policy, row = best
-        found = self.judge(unseen, policy, FINAL)
-        run["final"] = {**when(row), "seed": FINAL, "rows": found}
+        found = self.judge(unseen, policy, FINAL_SEED)
+        run["final"] = {**when(row), "seed": FINAL_SEED, "rows": found}
         if math.isinf(args.every):
             self.store(seed, result.state, row, found[self.own])
         self.save()
@@ -165,7 +166,7 @@ def measure(args: argparse.Namespace, clock: Clock) -> None:
     trials = Trials(args, training, clock, lambda env: rules(env, plan["rules"]), plan["choose_by"])
     if plan["choose_by"] == "seen":
         setup, policy = trials.setup, trials.setup.policy(trials.setup.learner.init(10_000))
-        untrained = trials.judge(setup.unseen, policy, FINAL)["policy"]
+        untrained = trials.judge(setup.unseen, policy, FINAL_SEED)["policy"]
         trials.record |= {"rover": args.rover, "target": args.target, "untrained": untrained}
     for seed in harness.in_time(clock, args.seeds):
         trials(seed)

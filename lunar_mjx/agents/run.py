@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lunar_mjx.agents import CHOOSING_SEED, FINAL_SEED, UNSEEN_PLACES
 from lunar_mjx.agents.configs import Training
 from lunar_mjx.agents.curves import plot_episodes, plot_progress
 from lunar_mjx.agents.evaluate import Evaluator, Score
@@ -46,8 +47,7 @@ def unseen_params(env: Any, options: Mapping[str, Any]) -> Any:
     ranges = None
     if options.get("ranges") == "unseen":
         ranges = tuple(unseen.get(r.parameter, r) for r in env.config.randomise)
-    # Any other seed; a prime, far from seeds that are counted up by hand.
-    return env.place(model, ranges, seed=env.config.place_seed + 7919, hardness=options.get("hardness"))
+    return env.place(model, ranges, seed=env.config.place_seed + UNSEEN_PLACES, hardness=options.get("hardness"))
 
 
 def soil_note(env: Any) -> str:
@@ -126,7 +126,7 @@ class Scorer:
         stop = self.target is not None and score.success >= self.target
         return {"unseen_success": score.success, "unseen_return": score.episode_return, "stop": stop}
 
-    def score(self, learner: Learner, state: TrainState, seed: int = 12345) -> Score:
+    def score(self, learner: Learner, state: TrainState, seed: int = CHOOSING_SEED) -> Score:
         """Scores the policy of a state."""
         if self._evaluator is None:
             self._evaluator = Evaluator(self._env, learner_agent(learner), self._episodes)
@@ -184,8 +184,7 @@ def run_training(
     learner = Learner(env, training.train)
     scorer = Scorer(env, training.unseen, eval_episodes, eval_every, target, folder, environment)
     result = train(learner, run, folder, environment, scorer)
-    # Another seed than the scores during training, by which the best policy was chosen.
-    score = scorer.score(learner, result.state, seed=54321)
+    score = scorer.score(learner, result.state, seed=FINAL_SEED)
     record = {
         "training": name,
         "environment": environment,

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lunar_mjx.agents import FINAL_SEED
 from lunar_mjx.commands.options import MOST_SEED
 from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.files import write_text
@@ -162,7 +163,7 @@ def evaluate(
     agent: AgentArgument = SHIPPED_AGENT,
     agent_option: AgentOption = None,
     episodes: Annotated[int, typer.Option(min=1, max=MOST_EPISODES)] = 256,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = 54321,
+    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED)] = FINAL_SEED,
     task: TaskOption = "large",
     terrain: Annotated[str | None, typer.Option(help="Terrain; the policy's unseen one if left out.")] = None,
     seen: Annotated[bool, typer.Option(help="On the ground and soil of the training instead.")] = False,

@@ -193,7 +193,7 @@ def test_seeds_train_one_after_another_with_the_same_programs(tmp_path, monkeypa
     measure.main()
     told = json.loads((tmp_path / "point.json").read_text())
     assert [run["seed"] for run in told["seeds"]] == [3, 4] and len(compiled) == 1
-    assert scored == [trials.FINAL, trials.FINAL], "with no scores before the last nothing is chosen"
+    assert scored == [trials.FINAL_SEED, trials.FINAL_SEED], "with no scores before the last nothing is chosen"
     for run in told["seeds"]:
         assert run["final"]["steps"] == run["epochs"][-1]["steps"] == 320 and run["scores"] == []
     first, second = (load_policy(tmp_path / f"point_seed{n}.npz") for n in (3, 4))
