@@ -22,8 +22,6 @@ class Evaluation:
 
     piece: int = 50
     """Steps that run on the device between looks whether all episodes are over."""
-    z: float = 1.959963984540054
-    """Standard deviations that a 95 % interval reaches to either side (the normal quantile of 0.975)."""
 
 
 EVALUATION = Evaluation()
@@ -62,11 +60,11 @@ class Score:
 
 def wilson(successes: float, count: int) -> tuple[float, float]:
     """95 % interval of a share (Wilson 1927)."""
-    share, z2 = successes / count, EVALUATION.z * EVALUATION.z
+    from scipy import stats
+
     # Wilson's interval stays within 0 and 1 and has a width for 0 of n, where the normal approximation has none.
-    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = EVALUATION.z / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    interval = stats.binomtest(round(successes), count).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def success_text(score: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.build_problem import known_logs
@@ -205,15 +206,13 @@ def _outcome(truth: str, verdict: Verdict, effects: tuple[str, ...]) -> str:
     return "unknown" if verdict is Verdict.UNKNOWN else "wrongly named"
 
 
-def wilson(count: int, of: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's 95 % interval of a rate (Wilson 1927)."""
+def wilson(count: int, of: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a rate (Wilson 1927); all of it where nothing was tried."""
     if of == 0:
         return 0.0, 1.0
     # The normal interval has no width at 0 of n, which is the very count that is hoped for.
-    p = count / of
-    middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
-    half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
-    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+    interval = stats.binomtest(count, of).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def _summary(cases: list[dict[str, Any]]) -> Audit:

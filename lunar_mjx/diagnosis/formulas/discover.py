@@ -236,7 +236,7 @@ def _in_drives(
     Each formula is an effect with one amount: all are scored by their evidence in linear approximation where the model
     as it is has been refitted, beside usual discrepancy, and the best are refitted.
     """
-    library = {t.name: t for t in terms(port, sensor_kinds(run, logs))}
+    library = {t.name: t for t in terms(port, sensor_kinds(logs))}
     form = build_drives(run, logs, None, progress, {name: effect_of(t) for name, t in library.items()}).own
     base = form.refit(frozenset(), None, None)
     before, nothing, places = base.linear.evidence(frozenset())
@@ -311,6 +311,6 @@ def _of_trial(trial: Trial, base: Fit) -> Row:
     return suggestion, tuple(c.term for _, (c, _) in sorted(trial.slots.held.items()))
 
 
-def sensor_kinds(run: Run, logs: Sequence[Log]) -> list[str]:
+def sensor_kinds(logs: Sequence[Log]) -> list[str]:
     """Kinds of measured channels: their names without corners."""
     return list(dict.fromkeys(channel_kind(c) for log in logs for c in log.channel_names if not is_command(c)))

@@ -20,14 +20,14 @@ _MOST_ROWS = 30
 """Channels and manoeuvres that a page lists at most, the worst first."""
 
 
-def plus_minus(value: Any, std: Any, unit: str = "") -> str:
-    """A value with its standard deviation and unit."""
+def plus_minus(value: Any, std: Any) -> str:
+    """A value with its standard deviation."""
     text = shown(value)
     if std is not None:
         stem, _, power = text.partition("e")
         # both in the same power of ten: 2.00e+05 ± 60000 is hard to read
         text = f"({stem} ± {shown(std / 10.0 ** int(power), 2)})e{power}" if power else f"{text} ± {shown(std, 2)}"
-    return f"{text} {unit}".rstrip() if unit not in ("", "1") else text
+    return text
 
 
 def error_rows(steps: Sequence[Step], judged: Sequence[Error], fitted: Sequence[Error | None], measure: str) -> Table:

@@ -40,7 +40,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     if (judge.verdict or {}).get("verdict") == "BAD_DATA":
         sections.append(Section("Why the logs cannot be used", tables.findings(judge)))
     if steps:
-        sections += [_error_section(steps, results), _where(judge, steps)]
+        sections += [_error_section(steps), _where(judge, steps)]
     if judge.verdict:
         sections.append(_why(judge, results))
     sections.append(Section("Parameters", tables.parameters(results[0], results[-1])))
@@ -48,10 +48,10 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
     title = f"Criticism of a model: {and_list(logs[:4])}" + (f" and {len(logs) - 4} more" if len(logs) > 4 else "")
     shown_sections = [s for s in sections if s.blocks]
-    return write_page(Path(out), title, _verdict(results, judge, steps), shown_sections, lead(results, judge))
+    return write_page(Path(out), title, _verdict(judge, steps), shown_sections, lead(results, judge))
 
 
-def _verdict(results: Sequence[Result], judge: Result, steps: Sequence[Step]) -> list[str]:
+def _verdict(judge: Result, steps: Sequence[Step]) -> list[str]:
     lines = []
     if judge.verdict:
         lines.append(f"Verdict on {judge.name}, {judge.verdict.get('verdict')}: {judge.verdict.get('sentence')}")
@@ -80,7 +80,7 @@ def _audit_line(result: Result) -> str:
     return f"{unknown}; lunar-mjx why {shlex.quote(str(result.path))} --audit 30 measures it in 30 minutes."
 
 
-def _error_section(steps: Sequence[Step], results: Sequence[Result]) -> Section:
+def _error_section(steps: Sequence[Step]) -> Section:
     splits, measure = judged(steps)
     errors = [e for s in steps if (e := error(s, splits)) is not None]
     fitted = [error(s, ("fit",)) for s in steps]
