@@ -35,7 +35,7 @@ class BatchView:
     """How pictures of a batch are lit."""
 
     rock_brightness: float = 1.5
-    """Brightness of rocks over that of soil: their surfaces are less dusty. A choice."""
+    """Of rocks over that of soil: their surfaces are less dusty. A choice."""
     lit_ground: float = 0.12
     """Share of sunlight that ground throws back to all sides."""
     horizon: float = 0.02

@@ -134,6 +134,7 @@ class _Stand:
         x, y, yaw = (np.interp(time, course.time, v) for v in (course.x, course.y, course.yaw))
         ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
         step = np.diff(np.stack([x, y], axis=-1), axis=0, prepend=[[x[0], y[0]]])
+        # Along the heading and with its sign: wheels turn back where the rover backs up, and not where it slides aside.
         way = np.cumsum((step * ahead).sum(axis=-1))
         frames = self._standing(np.stack([x, y], axis=-1), ahead)
         out = np.empty((len(time), self._mj.nbody, 7), np.float32)

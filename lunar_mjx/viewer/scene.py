@@ -110,12 +110,11 @@ def _grid(patch: Patch) -> dict[str, Any]:
 
 
 def _rocks(terrain: Terrain, near: Patch) -> list[list[float]]:
-    """Centre and the three semi-axes of every rock on the fine ground, as vectors one after another, (12,) m."""
+    """Of the rocks on the fine ground the centre x, y, z and the three semi-axes as vectors, (12,) m each."""
     if terrain.rocks is None:
         return []
     centers, (axes, turns) = np.asarray(terrain.rocks.centers, float), semi_axes(terrain.rocks)
     low, high = np.asarray(near.low), np.asarray(near.high)
-    # The last rock of every terrain is a dummy without size (see `build_rocks`).
     seen = (axes[:, 0] > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
     vectors = (turns * axes[:, None, :]).swapaxes(1, 2).reshape(-1, 9)
     return np.column_stack([centers, vectors])[seen].round(4).tolist()
