@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from lunar_mjx.cameras import Light, Pinhole, Pose, Sun, look_at, picture
 from lunar_mjx.cameras.batch import BATCH_VIEW, TINT
+from lunar_mjx.cameras.photometry import ROCK_BRIGHTNESS
 from lunar_mjx.terrain import Terrain, build_rocks, flat
 
 SUN = Sun(110.0, 25.0)
@@ -52,7 +53,7 @@ def analytic(pose: Pose, light: Light, camera: Pinhole) -> tuple[np.ndarray, np.
 
     def under(m0, g):
         bright = np.asarray(soil.radiance_factor(jnp.asarray(m0), jnp.asarray(mu), jnp.asarray(g)))
-        return bright * np.where(label == 2, BATCH_VIEW.rock_brightness, 1.0)
+        return bright * np.where(label == 2, ROCK_BRIGHTNESS, 1.0)
 
     value = under(mu0, phase) * ~shadow + light.earthshine * under(face @ earth, -(unit @ earth))
     diffuse = float(soil.radiance_factor(0.5, 1.0, 0.5)) / 0.5

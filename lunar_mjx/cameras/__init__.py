@@ -6,9 +6,11 @@ from lunar_mjx.cameras.batch import painted as painted
 from lunar_mjx.cameras.batch import picture as picture
 from lunar_mjx.cameras.batch import pictures as pictures
 from lunar_mjx.cameras.batch import stereo as stereo
+from lunar_mjx.cameras.batch import trodden as trodden
 from lunar_mjx.cameras.camera import LABELS as LABELS
 from lunar_mjx.cameras.camera import Images as Images
 from lunar_mjx.cameras.camera import RoverCamera as RoverCamera
+from lunar_mjx.cameras.chase import wheel_tracks as wheel_tracks
 from lunar_mjx.cameras.mount import facing as facing
 from lunar_mjx.cameras.mount import front_mount as front_mount
 from lunar_mjx.cameras.photometry import Film as Film

@@ -8,6 +8,7 @@ would gather; Earth shines without shadows.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,13 +17,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from lunar_mjx.cameras.mount import front_mount
-from lunar_mjx.cameras.photometry import Film, Regolith
+from lunar_mjx.cameras.photometry import ROCK_BRIGHTNESS, Film, Regolith
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
 from lunar_mjx.cameras.raymarch import in_parts, mounted
 from lunar_mjx.cameras.rays.trace import GROUND, ROCK, ROVER, SKY, trace
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.shapes import Placed, bodies, placed, rover_shapes, together
-from lunar_mjx.cameras.texture import ALBEDO
+from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
 from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import HeightField, Terrain, sample
 
@@ -34,10 +35,10 @@ TINT = ALBEDO / ALBEDO[0]
 class BatchView:
     """How pictures of a batch are lit."""
 
-    rock_brightness: float = 1.5
-    """Of rocks over that of soil: their surfaces are less dusty. A choice."""
     lit_ground: float = 0.12
     """Share of sunlight that ground throws back to all sides."""
+    edge: float = 0.1
+    """Share of painted ground, at each side, over which its mottling fades out."""
     horizon: float = 0.02
     """Share of the sky that lit slopes fill, as level ground sees it."""
 
@@ -183,6 +184,26 @@ def painted(shade: np.ndarray, low: Any, metres: Any) -> HeightField:
     )
 
 
+def trodden(tracks: Sequence[Track], low: Any, side: float, rows: int | None = None, texels: int = 2048) -> HeightField:
+    """Mottled ground with wheel tracks as `paint` of `picture`: the ruts and prints that `RoverCamera` shows of them.
+
+    Args:
+      tracks: of the wheels; see `chase.wheel_tracks`. low: west and south edge of a square, (2,) m. side: of it, m.
+      rows: of the tracks' places that are shown; all if None. texels: of a side.
+
+    Returns:
+      Brightness over that of plain soil, (texels, texels); 1 at the edge, so that all beyond is plain.
+    """
+    painter = TrackPainter(regolith(texels, side), list(low), [side, side], tracks)
+    ground = painter.paint(max((len(t.places) for t in tracks), default=0) if rows is None else rows)
+    # Over the mean albedo, since paint is a factor on the ground's own.
+    shown = np.asarray(ground, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean()))
+    at = np.linspace(0.0, 1.0, texels, dtype=np.float32)
+    inner = np.clip(np.minimum(at, 1.0 - at) / BATCH_VIEW.edge, 0.0, 1.0)
+    fade = np.minimum(inner[:, None], inner[None, :])  # beyond the paint its border's shade would go on as stripes
+    return painted(1.0 + fade * (shown - 1.0), low, side)
+
+
 def _brightness(
     light: Light, label: Any, face: Any, to_eye: Any, to_sun: Any, lit: Any, point: Any, paint: HeightField | None
 ) -> Any:
@@ -194,7 +215,7 @@ def _brightness(
     def under(to_light: Any) -> Any:
         mu0 = jnp.sum(face * to_light, axis=-1)
         ground = soil.radiance_factor(mu0, mu, jnp.sum(to_eye * to_light, axis=-1))
-        ground = ground * jnp.where(label == ROCK, BATCH_VIEW.rock_brightness, 1.0)
+        ground = ground * jnp.where(label == ROCK, ROCK_BRIGHTNESS, 1.0)
         # Paint diffuses; regolith throws light back to where it comes from.
         return jnp.where(label == ROVER, jnp.maximum(mu0, 0.0), ground)
 

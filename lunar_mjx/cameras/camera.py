@@ -9,10 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lunar_mjx.cameras.gl import Offscreen
+from lunar_mjx.cameras.gl import Offscreen, Post
 from lunar_mjx.cameras.mount import carried, front_mount
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
-from lunar_mjx.cameras.scene import FAR_GROUND, GROUND, ROCK, Sun, build_scene
+from lunar_mjx.cameras.scene import FAR_GROUND, GROUND, ROCK, Sun, build_scene, shadow_light
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.errors import bad_input
 from lunar_mjx.rover import Rover
@@ -98,6 +98,11 @@ class RoverCamera:
         self.model.tex_data[start : start + picture.size] = picture.ravel()
         self._offscreen.upload(texture)
 
+    def tread(self, tracks: Sequence[Track]) -> None:
+        """Shows wheel tracks that have grown since they were last shown, whole; for pictures while a rover drives."""
+        self._painter.follow(tracks)
+        self.roll(max(len(t.places) for t in tracks))
+
     def place(self, qpos: Any) -> None:
         """Puts the rover into the coordinates of its MJCF."""
         wanted = np.asarray(qpos, float)
@@ -127,11 +132,11 @@ class RoverCamera:
         rgba = np.concatenate([colours, np.full((*colours.shape[:2], 1), 255, np.uint8)], axis=-1)
         return Images(rgba, depth, self._labels[geoms], pose.view_matrix(), optics.projection_matrix())
 
-    def picture(self, pose: Pose, camera: Pinhole | None = None) -> np.ndarray:
-        """The colours alone, (height, width, 3) uint8: half the work of `take`."""
+    def picture(self, pose: Pose, camera: Pinhole | None = None, post: Post | None = None) -> np.ndarray:
+        """The colours alone, (height, width, 3) uint8, with a mark if there is one: half the work of `take`."""
         at = self.data.xpos[self._chassis]
         # The shadows' light follows the rover: its shadow map covers some metres only.
-        self._offscreen.look(self.data, pose, camera or self.camera, at + 10.0 * self.sun.direction)
+        self._offscreen.look(self.data, pose, camera or self.camera, shadow_light(at, self.sun), post)
         return self._offscreen.colours()
 
     def close(self) -> None:

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-from PIL import Image, ImageDraw
 
 from lunar_mjx.cameras.camera import RoverCamera
+from lunar_mjx.cameras.gl import Post
 from lunar_mjx.cameras.ground_map import MAP_COLOURS
-from lunar_mjx.cameras.pinhole import Pinhole, look_at, project
+from lunar_mjx.cameras.pinhole import Pinhole, look_at
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import Terrain
 
-_POST = 1.6
-"""Height of the post that marks a goal, m."""
+
+@dataclasses.dataclass(frozen=True)
+class GoalPost:
+    """The post that marks a goal: a choice."""
+
+    height: float = 1.6
+    """m."""
+    radius: float = 0.03
+    """m."""
+
+
+GOAL_POST = GoalPost()
 
 
 def wheel_places(rover: Rover, qpos: np.ndarray) -> np.ndarray:
@@ -37,7 +48,11 @@ def wheel_places(rover: Rover, qpos: np.ndarray) -> np.ndarray:
 
 def wheel_tracks(rover: Rover, qpos: np.ndarray) -> list[Track]:
     """Where a rover's wheels rolled, a row of places for each row of coordinates (time, nq)."""
-    places = wheel_places(rover, qpos)
+    return tracks_of(rover, wheel_places(rover, qpos))
+
+
+def tracks_of(rover: Rover, places: np.ndarray) -> list[Track]:
+    """The tracks of wheels whose centres went through places (time, wheel, 2 or 3) m."""
     return [Track(places[:, i, :2], w.width, 0.25 * w.radius) for i, w in enumerate(rover.wheels)]
 
 
@@ -71,28 +86,31 @@ class Chase:
         self._away, self._up = 8.0 * rover.standing_height + 2.0, 3.0 * rover.standing_height + 0.8
         self._tracks = bool(tracks)
 
-    def frame(self, qpos: Any, yaw: float, goal: Any, ground: float, row: int | None = None) -> np.ndarray:
+    def frame(
+        self, qpos: Any, yaw: float, goal: Any, ground: float, row: int | None = None, grown: Sequence[Track] = ()
+    ) -> np.ndarray:
         """One picture, (height, width, 3) uint8.
 
         Args:
           qpos: coordinates of the rover's MJCF. yaw: its heading, rad, smoothed if need be.
           goal: (2,) m. ground: height there, m.
           row: wheel tracks are shown up to this row of their places.
+          grown: tracks so far, where they are not known beforehand; those of the frame before, and on.
         """
         self._camera.place(qpos)
         if row is not None and self._tracks:
             self._camera.roll(row + 1)
+        if grown:
+            self._camera.tread(grown)
         at = np.asarray(qpos, float)[:3]
         behind = np.array([-math.cos(yaw), -math.sin(yaw), 0.0])
         pose = look_at(at + self._away * behind + np.array([0.0, 0.0, self._up]), at)
-        image = Image.fromarray(self._camera.picture(pose, self._optics))
         foot = np.array([*np.asarray(goal, float)[:2], ground])
-        top = foot + np.array([0.0, 0.0, _POST])
-        ends = project(pose, self._optics, np.stack([foot, top]))
-        if (ends[:, 2] > 0.1).all():
-            width = max(1, round(0.06 * self._optics.focal / float(ends[0, 2])))
-            ImageDraw.Draw(image).line([tuple(p[:2]) for p in ends], fill=MAP_COLOURS.goal, width=width)
-        return np.asarray(image)
+        depth = float((pose.position - foot) @ pose.rotation[:, 2])
+        # From far away it is a pixel wide, or it would come and go.
+        radius = max(GOAL_POST.radius, 0.5 * depth / self._optics.focal)
+        post = Post(foot, foot + np.array([0.0, 0.0, GOAL_POST.height]), radius, MAP_COLOURS.goal)
+        return self._camera.picture(pose, self._optics, post)
 
     def close(self) -> None:
         """Frees the OpenGL context."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 import warnings
@@ -18,6 +19,8 @@ from lunar_mjx.errors import UserError
 BACKENDS = ("egl", "osmesa")
 OFF = ("disable", "disabled", "off", "false", "0")
 
+_DULL = 0.1
+"""Share of a mark's colour that the Sun adds to; the mark shines with the rest."""
 _chosen: dict[tuple[str, ...], Any] = {}
 
 
@@ -72,6 +75,16 @@ def _first(names: tuple[str, ...]) -> Any:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Post:
+    """A mark in a picture: foot and top (3,) m, radius m, colour red, green and blue of 255."""
+
+    foot: np.ndarray
+    top: np.ndarray
+    radius: float
+    colour: tuple[int, int, int]
+
+
 class Offscreen:
     """MuJoCo's renderer in memory: colours, and in a second pass depth and what each pixel shows.
 
@@ -97,8 +110,10 @@ class Offscreen:
         # The reversed buffer keeps digits far away, where the usual one has none.
         self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
 
-    def look(self, data: Any, pose: Pose, camera: Pinhole, sun: np.ndarray | None = None) -> None:
-        """Places the camera; `sun` is where the shadows' light stands, (3,) m."""
+    def look(
+        self, data: Any, pose: Pose, camera: Pinhole, sun: np.ndarray | None = None, post: Post | None = None
+    ) -> None:
+        """Places the camera; `sun` is where the shadows' light stands, (3,) m, and `post` stands in this picture."""
         free = mujoco.MjvCamera()
         mujoco.mjv_updateScene(
             self._model, data, self._option, None, free, mujoco.mjtCatBit.mjCAT_ALL.value, self._scene
@@ -113,8 +128,20 @@ class Offscreen:
             for light in self._scene.lights[: self._scene.nlight]:
                 if not light.headlight:
                     light.pos = sun
+        if post is not None:
+            self._set_up(post)
         self._size = camera.width, camera.height
         self._camera = camera
+
+    def _set_up(self, post: Post) -> None:
+        geom = self._scene.geoms[self._scene.ngeom]
+        colour = np.array([*(_DULL * c for c in post.colour), 255], np.float32) / 255.0
+        capsule = mujoco.mjtGeom.mjGEOM_CAPSULE.value
+        mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour)
+        mujoco.mjv_connector(geom, capsule, post.radius, np.asarray(post.foot, float), np.asarray(post.top, float))
+        # It shines by itself, since it is a mark and no thing: the Sun would wash its colour out.
+        geom.emission, geom.specular = 0.9 / _DULL, 0.0
+        self._scene.ngeom += 1
 
     def colours(self) -> np.ndarray:
         """The picture, (height, width, 3) uint8."""

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from lunar_mjx.errors import bad_input, require_finite
 
 LAWS = ("hapke", "lommel_seeliger", "lambert")
+ROCK_BRIGHTNESS = 1.5
+"""Of rocks over that of soil: their surfaces are less dusty. A choice."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from lunar_mjx.cameras.mount import front_mount
+from lunar_mjx.cameras.photometry import ROCK_BRIGHTNESS, Film
 from lunar_mjx.cameras.pinhole import Pose
 from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
 from lunar_mjx.errors import bad_input
@@ -30,15 +31,21 @@ GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
 class SceneDetail:
     """How finely a scene is drawn."""
 
-    # Most nodes per side of the near and the far height field, and pixels of the ground's picture.
+    # Most nodes per side of the near and the far height field, and pixels of the pictures of their ground.
     nodes: int = 420
     far_nodes: int = 160
     texels: int = 2048
+    far_texels: int = 1024
     far_rocks: float = 60.0
     """How far beyond the near ground rocks are drawn, m: as far as the cameras in JAX look."""
     # How far the far ground is lowered under the near one, and everywhere, so that the two never meet, m.
     drop: float = 3.0
     seam: float = 0.05
+    shadow_reach: float = 40.0
+    """How far around the rover things throw shadows, m. MuJoCo has one shadow map: one of 60 m draws stripes on slopes
+    that the Sun grazes."""
+    shadow_texels: int = 8192
+    """Of a side of the shadow map: a centimetre each."""
 
 
 SCENE_DETAIL = SceneDetail()
@@ -76,6 +83,11 @@ class Patch:
     heights: np.ndarray
     low: tuple[float, float]
     high: tuple[float, float]
+
+
+def shadow_light(at: np.ndarray, sun: Sun) -> np.ndarray:
+    """Where the light of the shadow map stands, (3,) m, so that shadows are drawn around a place (3,) m."""
+    return at + SCENE_DETAIL.shadow_reach * sun.direction
 
 
 def cut(terrain: Terrain, low: np.ndarray, high: np.ndarray, most: int) -> Patch:
@@ -124,8 +136,8 @@ def build_scene(
     spec.stat.center = [0.0, 0.0, 0.0]
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.02, 400.0
-    visual.map.shadowclip, visual.map.shadowscale = 12.0, 0.9
-    visual.quality.shadowsize, visual.quality.offsamples = 4096, 4
+    visual.map.shadowclip, visual.map.shadowscale = SCENE_DETAIL.shadow_reach, 0.9
+    visual.quality.shadowsize, visual.quality.offsamples = SCENE_DETAIL.shadow_texels, 4
     visual.headlight.ambient, visual.headlight.diffuse = [0.04] * 3, [0.05] * 3
     visual.headlight.specular = [0.0] * 3
     spec.add_texture(
@@ -164,22 +176,19 @@ def _painter(patch: Patch, tracks: Sequence[Track]) -> TrackPainter:
     return TrackPainter(picture, patch.low, extent.tolist(), tracks)
 
 
-def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray | None, lower: Any = 0.0) -> None:
+def _add_ground(spec: Any, name: str, patch: Patch, picture: np.ndarray, lower: Any = 0.0) -> None:
     """The patch as a mesh: MuJoCo lights meshes smoothly, and height fields triangle by triangle."""
     vertices, normals, faces, texture = _surface(patch, lower)
     mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     mesh.uservert, mesh.usernormal = vertices.ravel(), normals.ravel()
     mesh.userface = mesh.userfacenormal = faces.ravel()
     material = spec.add_material(name=name, rgba=[1, 1, 1, 1], specular=0.0, shininess=0.0)
-    if picture is None:
-        material.rgba = [*ALBEDO, 1]
-    else:
-        mesh.usertexcoord, mesh.userfacetexcoord = texture.ravel(), faces.ravel()
-        file = io.BytesIO()
-        Image.fromarray(picture).save(file, "PNG", compress_level=1)
-        spec.assets = {**spec.assets, f"{name}.png": file.getvalue()}
-        spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    mesh.usertexcoord, mesh.userfacetexcoord = texture.ravel(), faces.ravel()
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG", compress_level=1)
+    spec.assets = {**spec.assets, f"{name}.png": file.getvalue()}
+    spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     spec.worldbody.add_geom(
         name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=name, mass=0.0, contype=0, conaffinity=0
     )
@@ -214,7 +223,14 @@ def _add_far(spec: Any, terrain: Terrain, near: Patch) -> None:
     if all(i.all() for i in inside) or (near.low == whole.low and near.high == whole.high):
         return
     hidden = inside[1][:, None] & inside[0][None, :]
-    _add_ground(spec, FAR_GROUND, whole, None, np.where(hidden, SCENE_DETAIL.drop, SCENE_DETAIL.seam))
+    extent = float(np.subtract(whole.high, whole.low).max())
+    _add_ground(
+        spec,
+        FAR_GROUND,
+        whole,
+        regolith(SCENE_DETAIL.far_texels, extent),
+        np.where(hidden, SCENE_DETAIL.drop, SCENE_DETAIL.seam),
+    )
 
 
 def _add_rocks(spec: Any, terrain: Terrain, low: np.ndarray, high: np.ndarray) -> None:
@@ -222,7 +238,9 @@ def _add_rocks(spec: Any, terrain: Terrain, low: np.ndarray, high: np.ndarray) -
     if terrain.rocks is None:
         return
     centers = np.asarray(terrain.rocks.centers, float)
-    spec.add_material(name=ROCK, rgba=[0.5, 0.48, 0.46, 1], specular=0.1, shininess=0.1)
+    # A screen shows the root of the light, by the cameras' gamma.
+    rock = ALBEDO * ROCK_BRIGHTNESS ** (1.0 / Film().gamma)
+    spec.add_material(name=ROCK, rgba=[*rock, 1], specular=0.0, shininess=0.0)
     for i, (center, axes, turn) in enumerate(zip(centers, *semi_axes(terrain.rocks), strict=True)):
         if axes[0] > 0 and (center[:2] > low).all() and (center[:2] < high).all():
             ball = terrain.rocks.forms is None

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
-ALBEDO = np.array([0.60, 0.585, 0.565])
-"""Colour of sunlit regolith on screen. The Moon reflects 12 %; a camera exposes for that."""
+ALBEDO = np.array([0.79, 0.77, 0.744])
+"""Colour of regolith under MuJoCo's light, which is 0.55 on level ground (`Sun.exposure`). So level ground is as bright
+on screen as the cameras in JAX expose it: 0.16 ** (1 / 2.2) = 0.435 (`Film`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,10 +75,13 @@ class TrackPainter:
         self._rows, cols = picture.shape[:2]
         self._scale = np.array([cols / metres[0], self._rows / metres[1]])
         self._shade = Image.new("L", (cols, self._rows), 255)
-        self._todo: list[tuple[int, list, int]] = []
-        for track in tracks:
-            self._todo += self._ruts(track) + self._prints(track)
-        self._todo.sort(key=lambda bar: bar[0])
+        self._painted = 0
+        self.follow(tracks)
+
+    def follow(self, tracks: Sequence[Track]) -> None:
+        """Takes tracks that have grown since; rows that are painted stay as they are."""
+        bars = [bar for track in tracks for bar in (*self._ruts(track), *self._prints(track))]
+        self._todo = sorted((bar for bar in bars if bar[0] >= self._painted), key=lambda bar: bar[0])
 
     def paint(self, rows: int) -> np.ndarray:
         """The picture after so many rows of the drive: soil a little darker, bars where grousers pressed."""
@@ -88,6 +92,7 @@ class TrackPainter:
             draw.polygon(corners, fill=shade)
             count += 1
         del self._todo[:count]
+        self._painted = max(self._painted, rows)
         return (self._ground * (np.asarray(self._shade, np.float32)[..., None] / 255.0)).astype(np.uint8)
 
     def _ruts(self, track: Track) -> list[tuple[int, list, int]]:

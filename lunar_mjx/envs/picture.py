@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.cameras.chase import Chase
+from lunar_mjx.cameras.chase import Chase, tracks_of, wheel_places
 from lunar_mjx.cameras.ground_map import GroundMap
+from lunar_mjx.cameras.texture import Track
 from lunar_mjx.envs.core import State
 from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.errors import UserError, bad_input
@@ -47,6 +48,8 @@ class Picture:
         self._top: GroundMap | None = None
         self._qpos = np.zeros(0)
         self._path: list[np.ndarray] = []
+        self._poses: list[np.ndarray] = []  # that no picture has shown yet
+        self._wheels: list[np.ndarray] = []  # their places until then
 
     @staticmethod
     def fits(env: Any) -> bool:
@@ -60,7 +63,7 @@ class Picture:
         self._goal = np.asarray(state.inner.goal[0])
         # The ground where the rover starts: cameras and markers count heights from there.
         self._ground = float(self._qpos[2]) - self.env.model.rover.standing_height
-        self._path = [self._qpos[:2]]
+        self._path, self._poses, self._wheels = [self._qpos[:2]], [self._qpos], []
         self._top, self._camera, self._tried = None, None, False
 
     def add(self, state: State, done: bool) -> None:
@@ -68,6 +71,7 @@ class Picture:
         if not done:
             self._qpos = np.asarray(state.inner.physics.qpos[0])
             self._path.append(self._qpos[:2])
+            self._poses.append(self._qpos)
 
     def frame(self) -> np.ndarray:
         """The picture now, (height, width, 3) uint8.
@@ -81,13 +85,21 @@ class Picture:
         yaw = float(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
         camera = self._open()
         if camera is not None:
-            return camera.frame(self._qpos, yaw, self._goal, self._ground)
+            return camera.frame(self._qpos, yaw, self._goal, self._ground, grown=self._tracks())
         if self._top is None:
             places = self._places()
             low, high = places.min(axis=0) - MAP_MARGINS.around, places.max(axis=0) + MAP_MARGINS.around
             self._top = GroundMap(self.env.params.system.terrain, low, high)
         size = 5.0 * self.env.model.rover.standing_height
         return self._top.frame(self._qpos, yaw, self._goal, self.env.config.goal_radius, self._path, size)
+
+    def _tracks(self) -> list[Track]:
+        """Where the wheels rolled so far; poses are turned into places of wheels once."""
+        rover = self.env.model.rover
+        if self._poses:
+            self._wheels.extend(wheel_places(rover, np.stack(self._poses)))
+            self._poses = []
+        return tracks_of(rover, np.stack(self._wheels))
 
     def _places(self) -> np.ndarray:
         ends = np.stack([self._path[0], self._goal])

@@ -26,14 +26,13 @@ from lunar_mjx.cameras import (
     front_mount,
     mounted,
     orbit,
-    painted,
     picture,
     placed,
     rover_shapes,
     together,
+    trodden,
+    wheel_tracks,
 )
-from lunar_mjx.cameras.chase import wheel_tracks
-from lunar_mjx.cameras.texture import ALBEDO, TrackPainter, regolith
 from lunar_mjx.dynamics import build
 from lunar_mjx.model import Model, make_model
 from lunar_mjx.report.style import BLUE, GREEN, HEIGHTS, HEIGHTS_DOWN, INK, MUTED, ORANGE, PAPER, SHADOW, SKY, VERMILION
@@ -58,8 +57,6 @@ _FILM = Film(mid=0.12)
 """A little darker than the cameras' own exposure, so that white parts are not burnt out."""
 _ROWS = 300
 """Places of a rover on its way here, from which its tracks are painted."""
-_EDGE = 0.1
-"""Share of the painted ground, at each side, over which its mottling fades out."""
 _LABEL_COLOURS = (SHADOW, MUTED, SKY, ORANGE)
 """Sky, ground, rock, rover: told apart without colour vision, and by their brightness."""
 _BOXES: dict[str, tuple[float, float, str, str, str]] = {
@@ -182,14 +179,7 @@ def _trodden(rovers: Sequence[tuple[Rover, np.ndarray]]) -> HeightField:
         way = np.tile(qpos, (_ROWS, 1))
         way[:, :2] -= np.linspace(12.0, 0.0, _ROWS)[:, None] * np.array([np.cos(yaw), np.sin(yaw)])
         tracks += wheel_tracks(rover, way)
-    low = rovers[0][1][:2] - 0.5 * side
-    trodden = TrackPainter(regolith(4096, side), low.tolist(), [side, side], tracks).paint(_ROWS)
-    # Over the mean albedo, since paint is a factor on the ground's own.
-    shade = np.asarray(trodden, np.float32).mean(axis=-1) / (255.0 * float(ALBEDO.mean()))
-    rows = np.linspace(0.0, 1.0, len(shade), dtype=np.float32)
-    inner = np.clip(np.minimum(rows, 1.0 - rows) / _EDGE, 0.0, 1.0)
-    fade = np.minimum(inner[:, None], inner[None, :])  # beyond the paint its border's shade would go on as stripes
-    return painted(1.0 + fade * (shade - 1.0), low, side)
+    return trodden(tracks, rovers[0][1][:2] - 0.5 * side, side, texels=4096)
 
 
 def figure_2() -> tuple[Figure, dict[str, Any]]:

@@ -85,7 +85,7 @@ def _shape(mj: mujoco.MjModel, i: int) -> dict[str, Any]:
 
 
 def ground_scene(terrain: Terrain, x: float, y: float) -> dict[str, Any]:
-    """The fine ground around a place, the whole ground coarsely, and the rocks nearby.
+    """The fine ground around a place, the whole ground coarsely, and the rocks as far as MuJoCo's pictures have them.
 
     Args:
       terrain: with NumPy arrays. x, y: m.
@@ -100,7 +100,7 @@ def ground_scene(terrain: Terrain, x: float, y: float) -> dict[str, Any]:
     return {
         "near": _grid(near),
         "far": _grid(cut(terrain, origin, end, SCENE_DETAIL.far_nodes)),
-        "rocks": _rocks(terrain, near),
+        "rocks": _rocks(terrain, near, SCENE_DETAIL.far_rocks),
     }
 
 
@@ -109,12 +109,12 @@ def _grid(patch: Patch) -> dict[str, Any]:
     return {"rows": rows, "cols": cols, "low": patch.low, "high": patch.high, "heights": _packed(patch.heights)}
 
 
-def _rocks(terrain: Terrain, near: Patch) -> list[list[float]]:
-    """Of the rocks on the fine ground the centre x, y, z and the three semi-axes as vectors, (12,) m each."""
+def _rocks(terrain: Terrain, near: Patch, beyond: float) -> list[list[float]]:
+    """Centre x, y, z and the three semi-axes as vectors, (12,) m, of each rock up to `beyond` m around fine ground."""
     if terrain.rocks is None:
         return []
     centers, (axes, turns) = np.asarray(terrain.rocks.centers, float), semi_axes(terrain.rocks)
-    low, high = np.asarray(near.low), np.asarray(near.high)
+    low, high = np.asarray(near.low) - beyond, np.asarray(near.high) + beyond
     seen = (axes[:, 0] > 0) & (centers[:, :2] > low).all(axis=1) & (centers[:, :2] < high).all(axis=1)
     vectors = (turns * axes[:, None, :]).swapaxes(1, 2).reshape(-1, 9)
     return np.column_stack([centers, vectors])[seen].round(4).tolist()

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lunar_mjx.cameras.scene import Sun, build_scene
+from lunar_mjx.cameras.scene import Sun, build_scene, shadow_light
 from lunar_mjx.errors import UserError
 from lunar_mjx.viewer.drive import PACE, LiveDrive, Pace
 
@@ -126,7 +126,7 @@ def _show(window: Any, model: mujoco.MjModel, data: mujoco.MjData, drive: LiveDr
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
             mujoco.mj_camlight(model, data)
-            data.light_xpos[0] = qpos[:3] + 10.0 * sun.direction  # shadows are drawn around the light
+            data.light_xpos[0] = shadow_light(qpos[:3], sun)  # shadows are drawn around the light
         window.set_texts((font, corner, names, values))
         window.sync()
         time.sleep(max(0.0, PACE.tick - (time.monotonic() - begin)))

@@ -9,12 +9,14 @@ import socket
 import threading
 import time
 
+import jax
 import numpy as np
 import pytest
 
 from lunar_mjx.errors import UserError
-from lunar_mjx.terrain import sample
+from lunar_mjx.terrain import Terrain, build_rocks, flat, sample
 from lunar_mjx.viewer.drive import PACE
+from lunar_mjx.viewer.scene import ground_scene
 from lunar_mjx.viewer.server import SERVER, Viewer
 from tests.viewer.viewer_client import ask, pictures
 
@@ -129,6 +131,15 @@ def test_ground_is_the_terrains(viewer):
     found = sample(viewer.drive.model.terrain.field, *(a.astype(np.float32) for a in np.meshgrid(x, y)))[0]
     np.testing.assert_allclose(heights, found, atol=2e-3)
     assert json.loads(ask(viewer, "GET", "/ground?x=1e9&y=0")[2])["near"]["cols"] > 1  # off the map: its edge
+
+
+def test_rocks_are_sent_as_far_as_pictures_show_them():
+    """Fine ground ends 20 m away; a boulder 50 m away is sent, and one 100 m away is not."""
+    ground = flat(240.0)
+    centres = np.array([[5.0, 0.0, 0.3], [50.0, 0.0, 0.3], [100.0, 0.0, 0.3]])
+    rocks = build_rocks(centres, np.full(3, 0.8), (-120.0, -120.0, 120.0, 120.0))
+    terrain = jax.device_get(Terrain(ground.field, rocks, None, np.zeros(3), "boulders"))
+    assert sorted(rock[0] for rock in ground_scene(terrain, 0.0, 0.0)["rocks"]) == [5.0, 50.0]
 
 
 def _drive(viewer, clock, seconds):

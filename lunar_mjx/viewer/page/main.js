@@ -5,7 +5,7 @@ import { Renderer } from "./render.js";
 import { Replay } from "./replay.js";
 import { cylinder, ground, shapeOf, sphere } from "./shapes.js";
 
-const GROUND = [0.60, 0.585, 0.565], ROCK = [0.5, 0.48, 0.46], STILL = pose([0, 0, 0], [1, 0, 0, 0]);
+const GROUND = [0.60, 0.585, 0.565], ROCK = GROUND.map((soil) => 1.5 * soil), STILL = pose([0, 0, 0], [1, 0, 0, 0]);
 const GHOST = [0.34, 0.71, 0.91], GHOSTLY = 0.55, POST = [0.03, 0.7], FLAG = [0.9, 0.62, 0.0];
 const FETCH_AGAIN = 7, BAR = 0.022, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
 

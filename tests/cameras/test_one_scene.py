@@ -1,0 +1,151 @@
+"""MuJoCo's renderer and the cameras in JAX look at one scene: rocks far away, shadows, brightness, tracks."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lunar_mjx.cameras import (
+    Light,
+    Pictures,
+    Pinhole,
+    Pose,
+    RoverCamera,
+    Sun,
+    Track,
+    look_at,
+    picture,
+    project,
+    trodden,
+)
+from lunar_mjx.cameras.camera import Images
+from lunar_mjx.cameras.chase import Chase
+from lunar_mjx.cameras.ground_map import MAP_COLOURS
+from lunar_mjx.rover import load_rover
+from lunar_mjx.terrain import Terrain, build_rocks, flat
+
+GROUND, ROCK = 1, 2
+EYE = Pinhole(160, 120, 45.0)
+SUN = Sun(180.0, 12.0)
+ROCKS = np.array([[18.0, 3.0], [28.0, -4.0], [42.0, 6.0], [54.0, -3.0]])
+RADIUS = 0.9
+
+
+@pytest.fixture(scope="module")
+def plain() -> Terrain:
+    """Level ground with four boulders 18 to 54 m away along x, half in the ground."""
+    ground = flat(160.0)
+    centres = np.column_stack([ROCKS, np.full(len(ROCKS), 0.2)])
+    rocks = build_rocks(centres, np.full(len(ROCKS), RADIUS), (-80.0, -80.0, 80.0, 80.0))
+    return Terrain(ground.field, rocks, None, jnp.zeros(3), "plain")
+
+
+def in_jax(terrain: Terrain, pose: Pose, sun: Sun, **more: object) -> Pictures:
+    given = (jnp.asarray(v, jnp.float32) for v in (pose.position, pose.rotation))
+    draw = jax.jit(lambda p, t: picture(terrain, p, t, EYE, Light(sun=sun), far=90.0, **more))
+    return jax.tree.map(np.asarray, draw(*given))
+
+
+@pytest.fixture(scope="module")
+def both(opengl: tuple[str, ...], plain: Terrain) -> tuple[Pose, Images, Pictures]:
+    pose = look_at((0.0, 0.0, 5.0), (30.0, 0.0, 0.0))
+    with RoverCamera(load_rover("luvmi_x"), plain, camera=EYE, sun=SUN, largest=(160, 120), backends=opengl) as camera:
+        qpos = camera.model.qpos0.copy()
+        qpos[:3] = -3.0, 0.0, 0.3
+        camera.place(qpos)
+        images = camera.take(pose)
+    return pose, images, in_jax(plain, pose, SUN)
+
+
+@pytest.fixture
+def allowed(opengl: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets `Chase` use OpenGL, which the tests' settings turn off."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+
+
+def test_both_see_the_same_rocks_up_to_54_m(both) -> None:
+    pose, drawn, found = both
+    assert (drawn.segmentation == found.label).mean() > 0.995
+    alike = (drawn.segmentation == found.label) & np.isfinite(drawn.depth) & np.isfinite(found.depth)
+    assert np.median(np.abs(drawn.depth[alike] / found.depth[alike] - 1.0)) < 0.002
+    for place in ROCKS:
+        u, v, depth = project(pose, EYE, np.array([[*place, 0.4]]))[0]
+        for label, seen in ((drawn.segmentation, drawn.depth), (found.label, found.depth)):
+            assert label[int(v), int(u)] == ROCK
+            assert depth - 1.0 < seen[int(v), int(u)] < depth + 0.5
+
+
+def test_both_see_the_shadows_of_rocks_up_to_28_m(both) -> None:
+    """The Sun is in the south: shadows lie north of the rocks. MuJoCo's map of shadows ends 40 m from the rover."""
+    pose, drawn, found = both
+    for place in ROCKS[:2]:
+        u, v, _ = project(pose, EYE, np.array([[place[0], place[1] + 2.0, 0.0]]))[0]
+        for colours, label in ((drawn.rgba[..., 0] / 255.0, drawn.segmentation), (found.rgb[..., 0], found.label)):
+            assert label[int(v), int(u)] == GROUND
+            assert colours[int(v), int(u)] < 0.5 * np.median(colours[label == GROUND])
+
+
+def test_ground_and_rocks_are_as_bright_in_both(both) -> None:
+    _, drawn, found = both
+    for kind in (GROUND, ROCK):
+        a = np.median(drawn.rgba[..., 0][drawn.segmentation == kind]) / 255.0
+        b = np.median(found.rgb[..., 0][found.label == kind])
+        assert a == pytest.approx(b, rel=0.2)
+
+
+def test_tracks_lie_at_the_same_place_in_both(opengl: tuple[str, ...]) -> None:
+    at = np.linspace(-2.0, 2.0, 101)
+    tracks = [Track(np.stack([at, np.full(101, y)], axis=-1), 0.4, 0.0) for y in (0.6, 1.6)]
+    ground, sun = flat(40.0), Sun(180.0, 60.0)
+    pose = look_at((0.0, 1.0, 5.0), (0.0, 1.0, 0.0), up=(0.0, 1.0, 0.0))
+    pictures = []
+    for shown in (tracks, []):
+        with RoverCamera(
+            load_rover("luvmi_x"), ground, camera=EYE, sun=sun, tracks=shown, largest=(160, 120), backends=opengl
+        ) as camera:
+            away = camera.model.qpos0.copy()
+            away[:3] = -6.0, 0.0, 0.3
+            camera.place(away)
+            pictures.append(camera.picture(pose).astype(float)[..., 0])
+        paint = trodden(shown, np.array([-10.0, -9.0]), 20.0)
+        pictures.append(in_jax(ground, pose, sun, paint=paint).rgb[..., 0])
+    drawn, found = pictures[0] / pictures[2] < 0.92, pictures[1] / pictures[3] < 0.95
+    assert drawn.mean() > 0.1
+    assert (drawn == found).mean() > 0.96
+
+
+def test_tracks_that_grow_are_those_known_beforehand(allowed: None) -> None:
+    """As the pictures of an environment are taken, which does not know where its rover will drive."""
+    rover, goal = load_rover("luvmi_x"), np.array([6.0, 0.0])
+    at = np.linspace(-3.0, 1.0, 81)
+    whole = [Track(np.stack([at, np.full(81, y)], axis=-1), 0.12, 0.05) for y in (-0.3, 0.3)]
+    qpos = rover.compile().qpos0.copy()
+    qpos[:3] = 1.0, 0.0, 0.3
+    ground, places = flat(40.0), np.array([[-3.0, 0.0], goal])
+    known = Chase(rover, ground, places, (160, 120), whole, SUN)
+    first, last = (known.frame(qpos, 0.0, goal, 0.0, row) for row in (0, 80))
+    known.close()
+    live = Chase(rover, ground, places, (160, 120), sun=SUN)
+    for end in (20, 41, 81):
+        grown = live.frame(qpos, 0.0, goal, 0.0, grown=[Track(t.places[:end], t.width, t.pitch) for t in whole])
+    live.close()
+    trodden_pixels = np.abs(last.astype(int) - first).sum(axis=-1) > 20
+    assert trodden_pixels.sum() > 100
+    assert np.abs(last.astype(int) - grown).sum(axis=-1)[trodden_pixels].mean() < 3.0
+
+
+def test_a_goal_behind_the_rover_is_hidden_by_it(allowed: None) -> None:
+    rover = load_rover("viper")
+    qpos = rover.compile().qpos0.copy()
+    qpos[:3] = 0.0, 0.0, rover.standing_height
+    chase = Chase(rover, flat(60.0), np.zeros((1, 2)), (160, 120), sun=SUN)
+    counts = []
+    for goal in ((2.5, 0.0), (-2.5, 0.0), (2.5, 3.0)):
+        image = chase.frame(qpos, 0.0, np.array(goal), -1.0).astype(int)
+        counts.append(int((np.abs(image - np.array(MAP_COLOURS.goal)).sum(axis=-1) < 120).sum()))
+    chase.close()
+    ahead, before_it, aside = counts
+    assert before_it > aside > 10
+    assert ahead < 0.5 * aside
