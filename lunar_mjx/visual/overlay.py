@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lunar_mjx.cameras.ground_map import MAP_COLOURS, GroundMap
 from lunar_mjx.report.style import MUTED
-from lunar_mjx.visual.plots import WHEEL_STYLES, bounds
+from lunar_mjx.visual.plots import CORNER_WORDS, WHEEL_STYLES, bounds
 from lunar_mjx.visual.recorded import RecordedDrive
 
 
@@ -89,7 +90,11 @@ class Overlay:
             f"winding   {self._hot[row]:7.1f} °C hottest",
         ]
         pad = self._line // 2
-        widest = max(self._font.getlength(lines[0]), 10.0 * self._line)
+        values_at = 4.6 * self._line
+        # The same width in every picture, whatever its numbers; without the words behind them in a small picture.
+        room = [values_at + self._font.getlength(f"-0000.0 mm{words}") for words in (" deepest", "")]
+        brief = room[0] > 0.4 * self._size[0]
+        widest = max(self._font.getlength(lines[0]), room[brief])
         glass = Image.new("RGBA", (round(widest) + 2 * pad, len(lines) * self._line + 2 * pad), COLOURS.glass)
         draw = ImageDraw.Draw(glass)
         for i, line in enumerate(lines):
@@ -97,7 +102,8 @@ class Overlay:
             y = pad + i * self._line
             draw.text((pad, y), name, font=self._font, fill=COLOURS.text if i == 0 else COLOURS.faint)
             if value_text:
-                draw.text((pad + 4.6 * self._line, y), value_text.strip(), font=self._font, fill=COLOURS.text)
+                shown = value_text.rsplit(" ", 1)[0] if brief else value_text
+                draw.text((pad + values_at, y), shown.strip(), font=self._font, fill=COLOURS.text)
         image.alpha_composite(glass, (8, 8))
 
     def _draw_strip(self) -> tuple[Image.Image, list[tuple[float, float, float, float]]]:
@@ -115,11 +121,16 @@ class Overlay:
         # A few spikes, as at a start, would flatten all else.
         low, high = min(0.0, float(np.percentile(slip, 1))), max(0.5, float(np.percentile(slip, 99)))
         colours = [wheel_colour(c) for c in self._drive.corners]
-        self._plot(draw, frames[0], slip, low, high, colours, "slip ratio")
+        dashed = [WHEEL_STYLES.get(c, (MUTED, "-"))[1] != "-" for c in self._drive.corners]
+        self._plot(draw, frames[0], slip, low, high, colours, "slip ratio", dashed)
         x = frames[0][0] + 5.5 * self._line
-        for corner, colour in zip(self._drive.corners, colours, strict=True):
-            draw.text((x, 0.3 * self._line), corner, font=self._font, fill=colour)
-            x += 1.8 * self._line
+        names = [CORNER_WORDS.get(c, c) for c in self._drive.corners]
+        room = frames[0][1] - x - len(names) * self._line
+        if sum(self._font.getlength(name) for name in names) > room:
+            names = self._drive.corners
+        for name, colour in zip(names, colours, strict=True):
+            draw.text((x, 0.3 * self._line), name, font=self._font, fill=colour)
+            x += self._font.getlength(name) + self._line
         hot = self._hot[:, None]
         self._plot(
             draw,
@@ -142,6 +153,7 @@ class Overlay:
         high: float,
         colours: list[tuple[int, int, int]],
         title: str,
+        dashed: Sequence[bool] = (False,),
     ) -> None:
         left, right, top, bottom = frame
         draw.text((left, 0.3 * self._line), title, font=self._font, fill=COLOURS.text)
@@ -157,9 +169,16 @@ class Overlay:
             )
         time = self._drive.time
         x = left + (time - time[0]) / (time[-1] - time[0]) * (right - left)
-        for column, colour in zip(values.T, colours, strict=True):
+        for column, colour, broken in zip(values.T, colours, dashed, strict=True):
             y = bottom - (np.clip(column, low, high) - low) / (high - low) * (bottom - top)
-            draw.line(list(zip(x.tolist(), y.tolist(), strict=True)), fill=colour, width=2)
+            for a, b in dashes(left, right, 0.6 * self._line) if broken else [(left, right)]:
+                at = np.unique(np.concatenate([[a, b], x[(x > a) & (x < b)]]))
+                draw.line(list(zip(at.tolist(), np.interp(at, x, y).tolist(), strict=True)), fill=colour, width=2)
+
+
+def dashes(left: float, right: float, length: float) -> list[tuple[float, float]]:
+    """Stretches of a broken line from left to right, with gaps half as long as the stretches; all in pixels."""
+    return [(a, min(a + length, right)) for a in np.arange(left, right, 1.5 * length).tolist()]
 
 
 class MapInset:

@@ -19,6 +19,9 @@ from lunar_mjx.visual.overlay import MapInset, Overlay
 from lunar_mjx.visual.recorded import RecordedDrive
 
 VIEWS = ("auto", "follow", "front", "top")
+_BEHIND = 1.2
+"""How much better a quarter behind is than one ahead, in the cosine between camera and Sun: as much as decides for it
+until the Sun is within about 45 degrees of the heading."""
 LONGEST = 20.0
 """Length of a video whose speed is chosen, s."""
 
@@ -132,11 +135,13 @@ class _Follow:
 
 
 def brightest_side(yaw: float, sun: np.ndarray) -> float:
-    """Direction from the rover to the camera, rad from its heading: the quarter from which its sunlit faces show."""
+    """Direction from the rover to the camera, rad from its heading: the quarter from which its sunlit faces show.
+
+    It is one behind, where the tracks are, unless the Sun stands nearly ahead, and all that one sees there is dark.
+    """
     quarters = np.array([math.pi - 0.6, math.pi + 0.6, 0.7, -0.7])
     towards = np.cos(yaw + quarters) * sun[0] + np.sin(yaw + quarters) * sun[1]
-    # from behind if that is not much darker
-    return float(quarters[int(np.argmax(towards + np.array([0.3, 0.3, 0.0, 0.0])))])
+    return float(quarters[int(np.argmax(towards + _BEHIND * np.array([1.0, 1.0, 0.0, 0.0])))])
 
 
 class _Top:

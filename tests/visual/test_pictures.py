@@ -13,7 +13,7 @@ from lunar_mjx.cameras.relief import relief
 from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import load_terrain
 from lunar_mjx.visual import encode
-from lunar_mjx.visual.overlay import MapInset
+from lunar_mjx.visual.overlay import MapInset, Overlay, dashes
 from lunar_mjx.visual.plots import terrain_preview
 from lunar_mjx.visual.recorded import read_drive
 from lunar_mjx.visual.video import brightest_side, frame_rows, render_video
@@ -100,6 +100,28 @@ def test_camera_stands_where_the_sun_lights_the_rover():
     east, sun_in_west = 0.0, np.array([-0.8, 0.3, 0.5])
     assert abs(brightest_side(east, sun_in_west)) == pytest.approx(np.pi - 0.6)  # behind, and to the left
     assert brightest_side(east, np.array([0.9, 0.1, 0.4])) == pytest.approx(0.7)
+    # light from the right and a little ahead: from behind one sees the lit side, and the tracks
+    assert brightest_side(east, np.array([0.65, -0.7, 0.26])) == pytest.approx(np.pi + 0.6)
+
+
+def test_numbers_lie_within_their_pane(luvmi):
+    """Over a white picture: what is brighter than the pane's glass within it is text, and outside of it is white."""
+    drive = read_drive(luvmi[0])
+    overlay = Overlay(drive, (960, 540), with_map=False)
+    overlay._sinkage = np.full_like(overlay._sinkage, 139.3)
+    shown = overlay.draw(np.full((540, 960, 3), 255, np.uint8), 0).astype(int).sum(axis=-1)
+    glass = shown[:140] < 500
+    edge = int(np.nonzero(glass.any(axis=0))[0].max())
+    text = (shown[10:140, : edge + 1] > 620) & glass[10:140, [100]]
+    rightmost = int(np.nonzero(text.any(axis=0))[0].max())
+    assert rightmost < edge - 4
+
+
+def test_rear_wheels_are_broken_lines():
+    """Told apart without colour, as in the plots."""
+    ends = dashes(10.0, 100.0, 12.0)
+    assert ends[0] == (10.0, 22.0) and ends[1][0] == 28.0 and ends[-1][1] <= 100.0
+    assert sum(b - a for a, b in ends) == pytest.approx(60.0, abs=12.0)
 
 
 def test_map_has_north_up(luvmi):
