@@ -242,8 +242,12 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     figure.colorbar(dots, ax=axes, label="mean |slip ratio| of the wheels", shrink=0.6, pad=0.01)
     axes.plot(*place[0], "o", color=LIT, markeredgecolor=SHADOW, markersize=8, label="start", zorder=4)
     axes.plot(*place[-1], "s", color=LIT, markeredgecolor=SHADOW, markersize=8, label="end", zorder=4)
-    # above the map: on it, tracks and outline would cross the words
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.3, fontsize=8, ncols=4)
+    _legend_above(axes, fontsize=8, ncols=4)
+
+
+def _legend_above(axes: Axes, **more: Any) -> None:
+    """Names what is drawn above the axes: upon them, words would hide lines and lines cross words."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.3, frameon=False, **more)
 
 
 def _slope(axes: Axes, drive: RecordedDrive) -> None:
@@ -251,7 +255,7 @@ def _slope(axes: Axes, drive: RecordedDrive) -> None:
     axes.plot(drive.time, along, color=INK, label="along the heading")
     axes.plot(drive.time, across, color=GREEN, linestyle="--", label="across (up to the left)")
     style(axes, "slope, °")
-    axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none", ncols=2)
+    _legend_above(axes, fontsize=7, ncols=2)
 
 
 def _wheels(axes: Axes, drive: RecordedDrive, values: np.ndarray) -> None:
@@ -273,7 +277,7 @@ def _wheels(axes: Axes, drive: RecordedDrive, values: np.ndarray) -> None:
 def _slip(axes: Axes, drive: RecordedDrive) -> None:
     _wheels(axes, drive, drive.per_wheel("wheel_{}_slip_ratio"))
     style(axes, "slip ratio")
-    axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none", ncols=4, handlelength=3.4)
+    _legend_above(axes, fontsize=7, ncols=4, handlelength=3.4)
 
 
 def _sinkage(axes: Axes, drive: RecordedDrive) -> None:
@@ -293,7 +297,7 @@ def _temperature(axes: Axes, drive: RecordedDrive) -> None:
     axes.plot(drive.time, winding[:, hottest], color=VERMILION, label=f"hottest: {where}")
     axes.plot(drive.time, housing[:, hottest], color=BLUE, linestyle="--", label="its housing")
     style(axes, "temperature, °C")
-    axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none", ncols=3)
+    _legend_above(axes, fontsize=7, ncols=3)
 
 
 def _power(axes: Axes, drive: RecordedDrive) -> None:

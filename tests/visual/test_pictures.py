@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from lunar_mjx.cameras import Sun
@@ -14,7 +15,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import load_terrain
 from lunar_mjx.visual import encode
 from lunar_mjx.visual.overlay import MapInset, Overlay, dashes
-from lunar_mjx.visual.plots import terrain_preview
+from lunar_mjx.visual.plots import drive_summary, terrain_preview
 from lunar_mjx.visual.recorded import read_drive
 from lunar_mjx.visual.video import brightest_side, frame_rows, render_video
 
@@ -33,6 +34,18 @@ def test_summary_plot(run, luvmi, tmp_path):
     assert picture.shape[1] > 1000
     assert (picture[:, : picture.shape[1] // 2].std(axis=-1) < 1).mean() > 0.8  # relief is grey
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+
+
+def test_legends_hide_no_line(luvmi):
+    """Each stands above its axes, and below what stands above them."""
+    figure = drive_summary(read_drive(luvmi[0]))
+    FigureCanvasAgg(figure).draw()
+    drawn = [axes for axes in figure.axes if axes.get_legend() is not None]
+    assert len(drawn) == 4
+    for axes in drawn:
+        legend = axes.get_legend().get_window_extent()
+        assert legend.y0 >= axes.bbox.y1 - 1.0
+        assert not any(legend.overlaps(other.bbox) for other in figure.axes)
 
 
 def test_terrain_preview(run, tmp_path):
