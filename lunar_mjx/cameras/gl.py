@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
 import importlib
 import os
@@ -107,6 +108,9 @@ class Offscreen:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
         # Freed with the object even if nobody calls close: contexts are few on some drivers.
         self._free = weakref.finalize(self, _free, self._mjr, self._context)
+        # At the end of Python, too, and before EGL is ended: what is registered last is called first.
+        self._free.atexit = False
+        atexit.register(self._free)
         # The reversed buffer keeps digits far away, where the usual one has none.
         self._mjr.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
 
@@ -189,6 +193,7 @@ class Offscreen:
     def close(self) -> None:
         """Frees the context."""
         self._free()
+        atexit.unregister(self._free)
         self._mjr = None
 
 

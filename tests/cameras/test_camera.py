@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 
 import numpy as np
@@ -98,6 +100,30 @@ def test_no_opengl_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.osmesa", None)
     with pytest.raises(UserError, match=r"no OpenGL works here .tried egl, osmesa.; install EGL .*libegl1"):
         camera_gl.context_class()
+
+
+UNCLOSED = """
+import weakref
+
+class Thing: pass
+
+thing = Thing()
+weakref.finalize(thing, int)  # as libraries do: from here on all that is left is freed last at the end
+from lunar_mjx.cameras import Pinhole, RoverCamera
+from lunar_mjx.rover import load_rover
+from lunar_mjx.terrain import flat
+
+camera = RoverCamera(load_rover("luvmi_x"), flat(20.0), camera=Pinhole(80, 60), largest=(80, 60))
+print(camera.front().depth.shape)
+"""
+
+
+def test_a_camera_that_nobody_closes_ends_without_a_word(opengl):
+    """EGL is ended by its own library when Python ends; contexts must be freed before."""
+    environment = {**os.environ, "MUJOCO_GL": opengl[0]}
+    ended = subprocess.run([sys.executable, "-c", UNCLOSED], capture_output=True, text=True, env=environment)
+    assert ended.returncode == 0 and ended.stdout == "(60, 80)\n"
+    assert "Error" not in ended.stderr and "Traceback" not in ended.stderr
 
 
 def test_mistakes_are_one_sentence(scene):
