@@ -66,7 +66,13 @@ def panels(steps: Sequence[Step]) -> list[Block]:
         channels = [c for c in channels if c in kept]
     # One scale of shades for all maps: a field that fades from one to the next is an error that fell.
     most = max(v for row in rms for v in row.values() if v is not None)
-    titles = [f"{_number(steps, s)}. {plot_text(s.short, 80).replace('&lt;br&gt;', ' ')}" for s in shown_steps]
+    level = len(units) <= 8
+    # seven pixels a letter: manoeuvres below, channels at the left
+    wide = 20 + 7 * min(max(len(o.unit_names[u]) for u in units), EXPLORE.name)
+    across = (wide if level else 44) * len(units)
+    # A title may be as long as its map is wide; the line break is for the rows of the first figure.
+    most_letters = max(80, across // 7)
+    titles = [f"{_number(steps, s)}. {plot_text(s.short.replace('<br>', ' '), most_letters)}" for s in shown_steps]
     height = 24 * len(channels)
     gap = 34 / (height * len(rms) + 34 * (len(rms) - 1))
     figure = make_subplots(len(rms), 1, shared_xaxes=True, subplot_titles=titles, vertical_spacing=gap)
@@ -91,9 +97,6 @@ def panels(steps: Sequence[Step]) -> list[Block]:
             row=n,
             col=1,
         )
-    level = len(units) <= 8
-    # seven pixels a letter: manoeuvres below, channels at the left
-    wide = 20 + 7 * min(max(len(o.unit_names[u]) for u in units), EXPLORE.name)
     beside = 50 + 7 * max(len(plot_text(channel_label(c))) for c in channels)
     finish(figure, 100 + (height + 34) * len(rms), margin={"l": 16, "r": 36, "t": 36, "b": 64})
     figure.update_yaxes(autorange="reversed", showgrid=False, type="category", automargin=True)
@@ -112,9 +115,7 @@ def panels(steps: Sequence[Step]) -> list[Block]:
         f"shades.{left}{fewer} What is held out was never fitted. Click a field, or choose from the list, to see what "
         "was measured, what the models say, and what they leave."
     )
-    return [
-        Explorer(figure, _detail(models), channel_rms, caption, least=beside + (wide if level else 44) * len(units))
-    ]
+    return [Explorer(figure, _detail(models), channel_rms, caption, least=beside + across)]
 
 
 def _number(steps: Sequence[Step], step: Step) -> int:

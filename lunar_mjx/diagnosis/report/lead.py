@@ -82,7 +82,7 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
             f"lunar-mjx next {run}  (names the manoeuvre that tells them apart)",
             "Drive that manoeuvre, and compare with its log too.",
         ],
-        "UNKNOWN": [f"lunar-mjx unknown {run}  (suggests a formula, as a ready effect file)"],
+        "UNKNOWN": _unlisted(judge),
         "UNDECIDABLE": [
             f"lunar-mjx next {run}  (names the manoeuvre that would show it)"
             if _searched(judge)
@@ -91,6 +91,14 @@ def _next(name: str, named: Sequence[str], judge: Result) -> list[str]:
         "BAD_FIT": ["The sentence above says what failed: look at the log and the model there, and compare again."],
         "BAD_DATA": ["Mend what the findings below name.", f"lunar-mjx log check {log}"],
     }.get(name, [])
+
+
+def _unlisted(judge: Result) -> list[str]:
+    """What is unlisted is sought under the contact law that explains the measurements, where that is another one."""
+    adding = _adding(judge, _law(judge))
+    where = adding[-1].rpartition(" ")[2] if adding else _typed(judge.path)
+    when = "if that is unknown, too: " if adding else ""
+    return [*adding, f"lunar-mjx unknown {where}  ({when}suggests a formula, as a ready effect file)"]
 
 
 def _using(run: Path) -> str:

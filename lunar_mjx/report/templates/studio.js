@@ -22,7 +22,7 @@ function add(parent, tag, text, className) {
   return made;
 }
 const shown = value => value === null || value === undefined ? "–" : value >= 100 ? value.toFixed(0) : value >= 10 ? value.toFixed(1) : value.toFixed(2);
-const percent = p => p > 0.999 ? "> 99.9 %" : p < 0.001 ? "< 0.1 %" : (100 * p).toFixed(p < 0.01 ? 1 : 0) + " %";
+const percent = p => p > 0.999 ? "> 99.9 %" : p < 0.001 ? "< 0.1 %" : (100 * p).toFixed(p < 0.01 || p >= 0.99 ? 1 : 0) + " %";
 
 function mix(from, to, share) {
   const part = at => Math.round(parseInt(from.slice(at, at + 2), 16) * (1 - share) + parseInt(to.slice(at, at + 2), 16) * share);
@@ -56,7 +56,7 @@ function drawProbabilities() {
     part.style.color = [1, 5].includes(i % fills.length) ? "#111" : "#fff";
   });
   const top = data.hypotheses.slice(0, 3).map(h => h.name + " " + percent(h.p));
-  add(box, "p", "Probabilities of what is missing, together 1: " + top.join("; ") + (data.hypotheses.length > 3 ? "; …" : "") + ".", "note");
+  add(box, "p", "Probabilities of what is missing, together 1: " + top.join("; ") + (data.hypotheses.length > 3 ? "; …" : "."), "note");
 }
 
 function drawEffects() {

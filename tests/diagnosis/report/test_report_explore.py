@@ -58,6 +58,13 @@ def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(
     json.dumps(block.panels, allow_nan=False)
 
 
+def test_the_title_of_a_map_names_all_that_was_added(result):
+    names = "stress_integral, exit_angle, side_entry, side_wall, slide_softening"
+    traces = dataclasses.replace(result.traces, labels=("as given", "refitted", f"with {names}"))
+    (block,) = explore.panels(chain([dataclasses.replace(result, traces=traces)]))
+    assert block.figure.layout.annotations[-1].text == f"3. + {names} (proposed)"
+
+
 def test_of_many_channels_the_worst_have_rows_and_all_are_in_the_list(result, monkeypatch):
     monkeypatch.setattr(explore, "EXPLORE", dataclasses.replace(explore.EXPLORE, channels=1))
     (block,) = explore.panels(chain([result]))

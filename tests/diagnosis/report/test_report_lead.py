@@ -63,6 +63,20 @@ def test_what_was_named_is_added_by_the_command_that_follows():
     assert found.next == ["lunar-mjx add run1 slip_sinkage -o with_slip_sinkage", "lunar-mjx why with_slip_sinkage"]
 
 
+def test_what_is_unlisted_is_sought_under_the_better_contact_law(run):
+    """The verdict says "the contact law explains these data better: add it"; so do the steps, before a formula."""
+    forms = {"closed form": 1e-9, "stress_integral": 1.0}
+    judge = result("run1", {"verdict": "UNKNOWN", "port": "wheel_normal", "forms": forms})
+    steps = [s.partition("  ")[0] for s in lead([judge], judge).next]
+    assert steps == [
+        "lunar-mjx add run1 stress_integral -o with_stress_integral",
+        "lunar-mjx why with_stress_integral",
+        "lunar-mjx unknown with_stress_integral",
+    ]
+    alone = result("run1", {"verdict": "UNKNOWN", "port": "soil"})
+    assert [s.partition("  ")[0] for s in lead([alone], alone).next] == ["lunar-mjx unknown run1"]
+
+
 def test_several_are_added_one_by_one_and_a_better_contact_law_first(run):
     forms = {"closed form": 1e-9, "stress_integral": 1.0}
     judge = result("run1", {"verdict": "MULTIPLE", "effects": ["side_wall", "bulldozing"], "forms": forms})

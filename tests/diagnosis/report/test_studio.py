@@ -217,6 +217,14 @@ def test_by_hand_in_a_browser(tmp_path, browser, table):
     page = studio.write_studio(write_run(tmp_path / "run", table, HOSTILE), tmp_path / "studio.html")
     browser.open(page.as_uri())
     browser.wait("document.body?.dataset.ready")
+    assert browser.value("[0.9995, 0.995, 0.98, 0.0982, 0.004].map(percent)") == [
+        "> 99.9 %",
+        "99.5 %",
+        "98 %",
+        "10 %",
+        "0.4 %",
+    ]
+    assert "…." not in browser.value("document.body.textContent")
     corner = 'document.querySelector(\'#heat [data-row="0"][data-column="{}"]\')'
     why = "document.getElementById('why').textContent.includes('{}')"
     assert browser.value("document.querySelectorAll('#heat tbody button').length") == (4 if table else 6)
