@@ -45,6 +45,24 @@ def test_keys_drive_what_the_page_shows(live_viewer, browser, tmp_path):
     assert not browser.problems
 
 
+def test_far_rocks_are_one_mesh_of_their_own_shapes(live_viewer, browser):
+    """Two ellipsoids, one turned: every corner lies on its own surface, and normals point along its gradient."""
+    browser.open(live_viewer.address)
+    browser.wait("Number(document.body?.dataset.pictures) > 0")
+    turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    rocks = [(np.array([40.0, -30.0, 0.2]), np.eye(3), np.ones(3)), (np.array([5.0, 50.0, 0.1]), turn, [0.9, 0.5, 0.3])]
+    given = [[*centre, *(axes * np.asarray(length)).T.ravel()] for centre, axes, length in rocks]
+    mesh = browser.value(f"import('/shapes.js').then(m => m.pebbles({[[float(v) for v in g] for g in given]}))")
+    places, normals = (np.reshape(mesh[k], (2, -1, 3)) for k in ("places", "normals"))
+    assert max(mesh["index"]) == places[0].shape[0] * 2 - 1
+    for (centre, axes, length), corners, out in zip(rocks, places, normals, strict=True):
+        own = (corners - centre) @ axes / length
+        np.testing.assert_allclose(np.linalg.norm(own, axis=1), 1.0, atol=1e-6)
+        gradient = (own / length) @ axes.T
+        np.testing.assert_allclose(out, gradient / np.linalg.norm(gradient, axis=1, keepdims=True), atol=1e-6)
+    assert not browser.problems
+
+
 def test_a_page_from_elsewhere_can_neither_read_nor_drive(live_viewer, browser):
     """The browser's own rules and the server's together, from a page without an origin of ours."""
     live_viewer.drive.pilot.hold([])

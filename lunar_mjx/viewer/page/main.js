@@ -3,7 +3,7 @@ import { add, clamp, lookAt, multiply, perspective, pose, scale } from "./maths.
 import { Panel, listen } from "./panel.js";
 import { Renderer } from "./render.js";
 import { Replay } from "./replay.js";
-import { cylinder, ground, shapeOf, sphere } from "./shapes.js";
+import { cylinder, ground, pebbles, shapeOf, sphere } from "./shapes.js";
 
 const GROUND = [0.60, 0.585, 0.565], ROCK = GROUND.map((soil) => 1.5 * soil), STILL = pose([0, 0, 0], [1, 0, 0, 0]);
 const GHOST = [0.34, 0.71, 0.91], GHOSTLY = 0.55, POST = [0.03, 0.7], FLAG = [0.9, 0.62, 0.0];
@@ -50,7 +50,11 @@ class View {
       this.soil.forEach((part) => part.mesh !== this.ball && this.renderer.free(part.mesh));
       this.soil = [{ mesh: this.renderer.upload(fine), model: STILL, colour: GROUND, kind: 1 },
         { mesh: this.renderer.upload(ground(far, under)), model: STILL, colour: GROUND, kind: 2 }];
-      for (const [cx, cy, cz, ...axes] of seen.rocks) {
+      const inside = ([cx, cy]) => cx > near.low[0] && cx < near.high[0] && cy > near.low[1] && cy < near.high[1];
+      const away = seen.rocks.filter((rock) => !inside(rock));
+      // one mesh, or a field of a thousand boulders would take as many calls a picture
+      if (away.length) this.soil.push({ mesh: this.renderer.upload(pebbles(away)), model: STILL, colour: ROCK, kind: 3, far: true });
+      for (const [cx, cy, cz, ...axes] of seen.rocks.filter(inside)) {
         const columns = [0, 3, 6].flatMap((i) => [...axes.slice(i, i + 3), 0]);
         const model = new Float32Array([...columns, cx, cy, cz, 1]);
         this.soil.push({ mesh: this.ball, model, colour: ROCK, kind: 3 });

@@ -296,7 +296,7 @@ export class Renderer {
     gl.polygonOffset(2.0, 4.0);
     gl.uniformMatrix4fv(this.depth.at.light, false, light);
     for (const part of parts)
-      if (part.kind !== 2) {
+      if (part.kind !== 2 && !part.far) {
         gl.uniformMatrix4fv(this.depth.at.model, false, part.model);
         this.triangles(part.mesh);
       }

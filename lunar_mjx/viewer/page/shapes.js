@@ -55,6 +55,31 @@ export function sphere([a, b, c]) {
   return made;
 }
 
+// Rocks far away as one mesh, coarsely: [centre x, y, z, three semi-axes as vectors] each.
+export function pebbles(rocks) {
+  const ball = turned([0, 1, 2, 3, 4, 5, 6].map((k) => {
+    const t = Math.PI * (k / 6 - 0.5);
+    return [Math.cos(t), Math.sin(t), Math.cos(t), Math.sin(t)];
+  }), 8);
+  const places = [], normals = [], index = [];
+  for (const [x, y, z, ...axes] of rocks) {
+    const first = places.length / 3, long = [0, 3, 6].map((i) => Math.hypot(...axes.slice(i, i + 3)));
+    for (let p = 0; p < ball.places.length; p += 3) {
+      const place = [x, y, z], normal = [0, 0, 0];
+      for (let i = 0; i < 3; i++)
+        for (let k = 0; k < 3; k++) {
+          place[k] += ball.places[p + i] * axes[3 * i + k];
+          normal[k] += ball.places[p + i] * axes[3 * i + k] / long[i] ** 2;
+        }
+      const length = Math.hypot(...normal);
+      places.push(...place);
+      normals.push(...normal.map((v) => v / length));
+    }
+    for (const i of ball.index) index.push(first + i);
+  }
+  return { places, normals, index };
+}
+
 export function capsule([r, h]) {
   const rows = [];
   for (let k = 0; k <= 16; k++) {
