@@ -47,7 +47,7 @@ NULLS: dict[str, dict[str, float]] = {
     "directional_gear_efficiency": {"asymmetry": 0.0},
     "slip_sinkage": {"driving": 0.0, "skid": 0.0},
     "multipass": {"plastic": 0.0},
-    "skid_shear": {"share": 0.0},
+    "skid_shear": {"share": 0.0, "reversal": 0.0},
     "friction_circle": {"share": 0.0},
     "bulldozing": {"front": 0.0, "side": 0.0},
     "rolling_resistance": {"coefficient": 0.0},

@@ -90,8 +90,9 @@ _PAPER_WINDING = WINDINGS[12]
 
 PRESET_PARAMETERS: Mapping[str, Mapping[str, Mapping[str, float | Mapping[str, float]]]] = {
     "consistent": {},
-    # the whole contact time of a braked wheel, hence j = r[(theta_1 - theta) - (sin theta_1 - sin theta)/(1 + s)]
-    "field": {"skid_shear": {"share": 1.0}},
+    # the whole contact time of a braked wheel, hence j = r[(theta_1 - theta) - (sin theta_1 - sin theta)/(1 + s)], and
+    # soil that is shoved ahead in front of it
+    "field": {"skid_shear": {"share": 1.0, "reversal": 1.0}},
     "paper": {
         "thermal_cutoff": {"hysteresis": 500.0},
         "joint_control": {"current_limit": _PAPER_WINDING["current_limit"]},
@@ -241,7 +242,7 @@ FIELD_CHANGES: tuple[Change, ...] = (
         "braking wheel",
         "displacement of eq. 8: the soil of a skidding wheel stays too little mobilised",
         "displacement over the wheel's own turning, 1/(1 + s)",
-        "skid_shear, share = 1",
+        "skid_shear, share = reversal = 1",
     ),
     Change(
         "shear strength",

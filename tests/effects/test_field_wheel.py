@@ -208,6 +208,17 @@ def test_braking_soil_is_mobilised_over_the_wheels_own_turning() -> None:
     assert 0.75 * wanted < brake(0.0) < 0.9 * wanted
 
 
+def test_without_reversal_soil_is_sheared_one_way_along_the_whole_rim() -> None:
+    """As many models have it; a wheel's own turning and the shear that turns about are told apart."""
+    m = Motion(0.02, 0.2, 0.0, 0.18)
+    names = ("soil", "stress_integral", "skid_shear")
+    one_way, about = (
+        float(_wheels([m], names, skid_shear={"share": 1.0, "reversal": q}).force.x[0]) for q in (0.0, 1.0)
+    )
+    assert one_way == pytest.approx(_straight_pull(m), rel=1e-3)
+    assert one_way < 1.2 * about < 0.0
+
+
 def test_a_braked_wheel_meets_more_support_the_deeper_it_sinks() -> None:
     """From 0.4 to 0.9 radii at 90 % skid, in equal steps: each bears more than the one before, and not ever less so.
 

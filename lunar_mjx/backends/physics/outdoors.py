@@ -90,7 +90,7 @@ def multipass(c: Context, p: SimpleNamespace, soil: Values, places: Values) -> V
 
 def skid_reversal(c: Context, p: SimpleNamespace) -> None:
     """theta_0 with cos(theta_0 + X) = (1 - |s|) cos X, X = 45 deg - phi/2: in front of it soil is shoved ahead; rad."""
-    turning = 1.0 - p.share * 0.5 * (c.contact["soil_slid"] - c.contact["soil_slip"])
+    turning = 1.0 - p.reversal * 0.5 * (c.contact["soil_slid"] - c.contact["soil_slip"])
     break_out = 0.5 * (0.5 * np.pi - np.arctan(c.soil["tan_phi"]))
     angle = np.arccos(turning * np.cos(break_out)) - break_out
     c.normal["reversal"] = np.where(turning < 1.0, angle, 0.0)
@@ -110,7 +110,7 @@ def skid_shear(c: Context, p: SimpleNamespace) -> None:
     # a wheel sunk to its axle has an upright front, where the sines of both ends are alike
     chord = np.maximum(np.cos(theta_1 - half), 0.05) * np.sinc(half / np.pi)
     kept = np.maximum(1.0 - 1.0 / chord - slip["direction"] * slip["slip_x"], 0.0)
-    slip["slip_ahead"] = slip["slip_x"] + p.share * slip["direction"] * kept
+    slip["slip_ahead"] = slip["slip_x"] + p.reversal * slip["direction"] * kept
 
 
 def earth_pressure(c: Context, weight: float, depth: np.ndarray, squared: np.ndarray) -> np.ndarray:

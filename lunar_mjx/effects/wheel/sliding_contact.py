@@ -200,7 +200,7 @@ def side_exit(ctx, p, x, normal):
 
 
 def _angle_of_reversal(ctx, p, x, normal):
-    skid = p.share * 0.5 * (ctx.contact.soil_slid - ctx.contact.soil_slip)
+    skid = p.reversal * 0.5 * (ctx.contact.soil_slid - ctx.contact.soil_slip)
     break_out = 0.25 * jnp.pi - 0.5 * jnp.arctan(ctx.soil.tan_phi)
     turned = jnp.arccos((1.0 - skid) * jnp.cos(break_out)) - break_out
     return dataclasses.replace(normal, reversal=jnp.where(skid > 0.0, turned, 0.0))
@@ -221,7 +221,7 @@ def _own_turning(ctx, p, x, wheel):
         wheel,
         slip_x=slip_x,
         slip_y=wheel.slip_y * stretch / (1.0 + p.share * skid),
-        slip_ahead=slip_x + p.share * wheel.direction * kept,
+        slip_ahead=slip_x + p.reversal * wheel.direction * kept,
     )
 
 
@@ -235,21 +235,30 @@ skid_shear = Effect(
             0.0,
             (0.0, 1.0),
             "1",
-            "0: contact time of eq. 9, sheared one way; 1: that of the wheel's own turning, reversed in front",
+            "0: contact time of eq. 9; 1: that of the wheel's own turning",
             "choice: a locked wheel's contact has no end; the preset field takes 1",
-        )
+        ),
+        "reversal": Parameter(
+            0.9,
+            0.0,
+            (0.0, 1.0),
+            "1",
+            "0: sheared one way along the whole rim; 1: turned about in front of theta_0",
+            "choice: as for share; the preset field takes 1",
+        ),
     },
     doc="""Soil stays under a braked wheel for (theta_1 - theta)/omega, and in front of theta_0 it is shoved ahead.
 
     The slip of eq. 8, referred to v_x when braking, makes the displacement finite for a locked wheel, and much too
-    small. With s = 1 - r omega/v_x: slip_x/(1 - q s) and slip_y/((1 - q s)(1 + q s)), which at q = 1 is the
-    kinematics of Janosi & Hanamoto 1961, j_x = int (r omega - v_x cos) dt and j_y = int v_y dt. The stretch ends at
+    small. With s = 1 - r omega/v_x and a share q: slip_x/(1 - q s) and slip_y/((1 - q s)(1 + q s)), which at q = 1 is
+    the kinematics of Janosi & Hanamoto 1961, j_x = int (r omega - v_x cos) dt and j_y = int v_y dt. The stretch ends at
     100, where the soil of a locked wheel is fully mobilised.
 
-    That holds where soil stays and the rim passes over it. Where the rim moves at more than X = 45 deg - phi/2 from its
-    normal, cos(theta_0 + X) = (1 - s) cos X, the soil gives way ahead and up along that slip line instead: in front of
-    theta_0 it is not dragged back, j_x(theta_0) >= 0, and behind it the shear begins anew (Wong & Reece 1967, part II:
-    towed wheels, whose shear turns about there). Driving, theta_0 = 0 and nothing changes.""",
+    That holds where soil stays and the rim passes over it, and many models of wheels end there. Where the rim moves at
+    more than X = 45 deg - phi/2 from its normal, cos(theta_0 + X) = (1 - s) cos X, the soil gives way ahead and up
+    along that slip line instead: in front of theta_0 it is not dragged back, j_x(theta_0) >= 0, and behind it the shear
+    begins anew (Wong & Reece 1967, part II: towed wheels, whose shear turns about there). A reversal q takes q s for s
+    in theta_0, and a share q of what the slip in front changes by. Driving, theta_0 = 0 and nothing changes.""",
 )
 
 
