@@ -251,15 +251,12 @@ def improve(
     split: SplitOption = None,
     discrepancy: DiscrepancyOption = None,
     setting: SettingOption = None,
-    keep_going: Annotated[
-        bool, typer.Option(help="Go on through UNKNOWN while an effect earns its place on held-out manoeuvres.")
-    ] = False,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Run the whole loop unattended; the exit status is the last verdict.
 
-    Where something is named, each round adds every effect that is more probable than not: that model foresees best.
+    Each round adds every effect that is more probable than not: that model foresees best. It ends where there is none.
     """
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
@@ -273,7 +270,6 @@ def improve(
             effects or (),
             _pairs("--split", split),
             seed,
-            keep_going=keep_going,
             discrepancy=_numbers("--discrepancy", discrepancy),
             progress=progress,
             settings=_pairs("--setting", setting),

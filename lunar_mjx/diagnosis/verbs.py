@@ -322,20 +322,18 @@ def improve(
     splits: Mapping[str, str] | None = None,
     seed: int = 0,
     most: int = 8,
-    keep_going: bool = False,
     discrepancy: Mapping[str, float] | None = None,
     progress: Progress = silent,
     settings: Mapping[str, Any] | None = None,
 ) -> tuple[Diagnosis, list[Run]]:
-    """The whole loop unattended: compare, why, add, until the verdict is neither KNOWN nor MULTIPLE.
+    """The whole loop unattended: compare, why, add, until nothing is more probable than not.
 
-    What a round adds is every effect that is more probable than not, beside at least one that is sure.
+    What a round adds is every effect that is, where the verdict names something or is UNKNOWN.
 
     Args:
       logs, model, effects, splits, seed, discrepancy, progress, settings: as for `compare`.
       out: folder of the runs run1, run2, ...
       most: effects added at most.
-      keep_going: go on also through UNKNOWN while some catalogue effect earns its place on held-out manoeuvres.
 
     Returns:
       The last verdict, and the runs.
@@ -348,7 +346,7 @@ def improve(
     runs = [run]
     while True:
         diagnosis = why(run, progress=progress)
-        names = _next_to_add(diagnosis, run, keep_going)
+        names = _next_to_add(diagnosis, run)
         if not names or len(runs) > most:
             return diagnosis, runs
         # A verdict calls the user's own effects by their bare names; to be added again they need their file.
@@ -383,25 +381,23 @@ def _add(
     return _compare(child, progress)
 
 
-def _next_to_add(diagnosis: Diagnosis, run: Run, keep_going: bool) -> list[str]:
+def _next_to_add(diagnosis: Diagnosis, run: Run) -> list[str]:
     """What `improve` adds next: the effects that are more probable than not, and the most probable contact law.
 
     Names are said where they are sure; a model is grown to foresee. Of all single models the one of the terms that are
     more probable than not foresees best in the mean square (the median probability model, Barbieri & Berger 2004). It
     is made of the most probable contact law: there is no model without a law, so that keeping the old one is a choice
-    like any other. A law alone is exchanged where it is surely better. Beside something unlisted what is sure in itself
-    is added, or with `keep_going` all that helps.
+    like any other. A law alone is exchanged where it is surely better. Something unlisted changes none of this: effects
+    that are more probable than not beside it foresee better than their absence does.
     """
     # Calibration belongs to the instruments of these logs, and not into a model for other drives.
-    names = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
+    probable = [n for n, p in diagnosis.inclusion.items() if p > 0.5 and ": " not in n]
+    named = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
     sure = float(run.settings.get("sure", SearchSettings().sure))
-    if diagnosis.verdict is Verdict.UNKNOWN and not keep_going:
-        names = [n for n in names if diagnosis.inclusion.get(n, 0.0) >= sure]
-    elif diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE):
-        probable = [n for n, p in diagnosis.inclusion.items() if p > 0.5 and ": " not in n]
-        names = list(dict.fromkeys([*names, *probable]))
-    elif diagnosis.verdict is not Verdict.UNKNOWN:
-        names = []
+    if diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE):
+        names = list(dict.fromkeys([*named, *probable]))
+    else:
+        names = probable if diagnosis.verdict is Verdict.UNKNOWN else []
     # Beside an effect any likelier law is taken; alone it must be sure, or rounds would swap laws to and fro.
     law = better_law(diagnosis.forms, run.model, 0.0 if names else sure)
     return [*([law] if law else []), *names]

@@ -35,6 +35,8 @@ unlisted input: it is undecidable, and keeps its prior probability without being
 FIRST_ALIKE = 2
 """Effects most like what is unlisted that are refitted beside one set before what else is promised: several are alike
 at one port."""
+BETTER = 1.0
+"""nat; gain by which a further refit of a set has found another optimum: less than that changes no ranking."""
 UNLISTED_SHARE = 0.5
 """Probability of something unlisted from which every effect that could be seen is refitted from where it acts: more
 probable than not."""
@@ -327,6 +329,10 @@ class _Search:
         estimated = self.known.get((form.name, listed))
         if self.score_around(form, made, near):
             self.done[key] = made
+            reached = self.known[form.name, listed].log_posterior
+            # What was refitted without an effect of the set began at a worse optimum of it, and challenges nothing now.
+            if estimated is not None and estimated.refitted and reached > estimated.log_posterior + BETTER:
+                self.begun = {b for b in self.begun if (b[0], b[2]) != key}
             if estimated is not None and estimated.promise is not None and not made.failed:
                 self.hold(estimated.promise, self.known[form.name, listed])
         elif key not in self.done:
