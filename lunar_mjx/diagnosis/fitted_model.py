@@ -33,14 +33,13 @@ def fitted_model(
         c = coordinates[i]
         if c.nuisance or c.effect not in model.effect_names or c.name in (held or {}):
             continue
-        # at a bound rounding may lie beyond it
         value = min(max(float(c.value(u[i])), c.low), c.high)
         old = model.parameters[c.effect][c.name]
+        low, high = next(e for e in model.effects if e.name == c.effect).parameters[c.name].bounds
         # A factor keeps the differences between wheels that the model holds; a plain value is one for all of them.
-        if c.factor:
-            new: Any = tuple(v * value for v in old) if isinstance(old, tuple) else float(old) * value
-        else:
-            new = tuple(value for _ in old) if isinstance(old, tuple) else value
+        # At a bound rounding may lie beyond it, of the factor and again of what it multiplies.
+        each = [min(max(float(v) * value if c.factor else value, low), high) for v in np.atleast_1d(old)]
+        new: Any = tuple(each) if isinstance(old, tuple) else each[0]
         model = model.set(c.effect, "fit", **{c.name: new})
     return model
 

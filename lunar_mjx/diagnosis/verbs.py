@@ -333,7 +333,7 @@ def improve(
     Args:
       logs, model, effects, splits, seed, discrepancy, progress, settings: as for `compare`.
       out: folder of the runs run1, run2, ...
-      most: effects added at most.
+      most: rounds that add something at most.
 
     Returns:
       The last verdict, and the runs.
@@ -387,17 +387,22 @@ def _next_to_add(diagnosis: Diagnosis, run: Run) -> list[str]:
     Names are said where they are sure; a model is grown to foresee. Of all single models the one of the terms that are
     more probable than not foresees best in the mean square (the median probability model, Barbieri & Berger 2004). It
     is made of the most probable contact law: there is no model without a law, so that keeping the old one is a choice
-    like any other. A law alone is exchanged where it is surely better. Something unlisted changes none of this: effects
-    that are more probable than not beside it foresee better than their absence does.
+    like any other. A law alone is exchanged where it is surely better. Something unlisted changes none of this: where it
+    acts, shares of the effects are not known, and their absence is no better guess.
     """
+    shares, instruments = diagnosis.inclusion, ("unlisted at ", "calibration")
     # Calibration belongs to the instruments of these logs, and not into a model for other drives.
-    probable = [n for n, p in diagnosis.inclusion.items() if p > 0.5 and ": " not in n]
-    named = [n for n in diagnosis.effects if not n.startswith("calibration: ")]
+    named = [n for n in diagnosis.effects if not n.startswith(instruments)]
     sure = float(run.settings.get("sure", SearchSettings().sure))
+    names: list[str] = []
     if diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE):
-        names = list(dict.fromkeys([*named, *probable]))
-    else:
-        names = probable if diagnosis.verdict is Verdict.UNKNOWN else []
+        names = list(
+            dict.fromkeys([*named, *(n for n, p in shares.items() if p > 0.5 and not n.startswith(instruments))])
+        )
+    elif diagnosis.verdict is Verdict.UNKNOWN:
+        # of what helps beside it: what held-out drives have taken back is no longer among that
+        names = [n for n in named if shares.get(n, 0.0) > 0.5]
+    names = [n for n in names if n not in run.model.effect_names]
     # Beside an effect any likelier law is taken; alone it must be sure, or rounds would swap laws to and fro.
     law = better_law(diagnosis.forms, run.model, 0.0 if names else sure)
     return [*([law] if law else []), *names]

@@ -43,7 +43,21 @@ def test_where_something_is_missing_every_effect_more_probable_than_not_is_added
         "exit_angle": 0.6,
         "grousers": 0.4,
         "unlisted at wheel_normal: resistance": 0.9,
+        "unlisted at motor_torque": 0.8,
         "calibration: slip": 0.8,
+        "calibration.pitch": 0.7,
     }
-    said = Diagnosis(verdict, ("side_wall",), "", inclusion=probable)
+    said = Diagnosis(verdict, ("side_wall", "exit_angle"), "", inclusion=probable)
     assert _next_to_add(said, Run(tmp_path, (), model)) == added
+
+
+def test_what_held_out_drives_have_taken_back_is_not_added(tmp_path):
+    model = make_model("luvmi_x", terrain="flat", preset="consistent")
+    said = Diagnosis(Verdict.UNKNOWN, (), "", inclusion={"side_wall": 0.99})
+    assert _next_to_add(said, Run(tmp_path, (), model)) == []
+
+
+def test_what_a_model_has_is_not_added_again(tmp_path):
+    model = make_model("luvmi_x", terrain="flat", preset="consistent").add("side_wall", "add")
+    said = Diagnosis(Verdict.KNOWN, ("side_wall",), "", inclusion={"side_wall": 0.99, "exit_angle": 0.6})
+    assert _next_to_add(said, Run(tmp_path, (), model)) == ["exit_angle"]

@@ -343,13 +343,20 @@ def test_a_better_optimum_of_a_set_is_challenged_anew():
     under_way.begin()
     wave = frozenset({"wave"})
     place = form.name, form.listed(wave)
-    under_way.refit(form, wave, under_way.known[form.name, frozenset()])
+    base = under_way.known[form.name, frozenset()]
+    under_way.refit(form, wave, base)
     under_way.refit(form, frozenset(), under_way.known[place])
-    assert under_way.challenged(form.name) == wave
-    under_way.refit(form, wave, under_way.known[form.name, frozenset()])
-    assert under_way.challenged(form.name) == wave
-    # as if the first had ended higher up
-    worse = dataclasses.replace(under_way.known[place], log_posterior=under_way.known[place].log_posterior - 49.0)
-    under_way.known[place] = worse
-    under_way.refit(form, wave, under_way.known[form.name, frozenset()])
-    assert not under_way.challenged(form.name)
+    assert under_way.challenged(under_way.known[place]) == wave
+    under_way.refit(form, wave, base)
+    assert under_way.challenged(under_way.known[place]) == wave
+    # another set without it, from where that has ended, is no challenge of what comes now
+    both = frozenset({"wave", "square"})
+    under_way.refit(form, both, under_way.known[place])
+    under_way.refit(form, frozenset({"square"}), under_way.known[form.name, form.listed(both)])
+    # as if the first refit had ended further below
+    first = under_way.known[place]
+    under_way.known[place] = dataclasses.replace(first, log_posterior=first.log_posterior - 49.0)
+    under_way.refit(form, wave, base)
+    assert not under_way.challenged(under_way.known[place])
+    under_way.refit(form, frozenset(), under_way.known[place])
+    assert under_way.challenged(under_way.known[place]) == wave

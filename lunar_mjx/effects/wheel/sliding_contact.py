@@ -258,7 +258,8 @@ skid_shear = Effect(
     more than X = 45 deg - phi/2 from its normal, cos(theta_0 + X) = (1 - s) cos X, the soil gives way ahead and up
     along that slip line instead: in front of theta_0 it is not dragged back, j_x(theta_0) >= 0, and behind it the shear
     begins anew (Wong & Reece 1967, part II: towed wheels, whose shear turns about there). A reversal q takes q s for s
-    in theta_0, and a share q of what the slip in front changes by. Driving, theta_0 = 0 and nothing changes.""",
+    in theta_0, and a share q of what the slip in front changes by; forces between 0 and 1 need not lie between theirs.
+    Driving, theta_0 = 0 and nothing changes.""",
 )
 
 

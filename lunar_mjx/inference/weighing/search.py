@@ -185,6 +185,7 @@ class _Search:
       asked: form and effects of sets beside which a doubted effect was refitted.
       over: whether time was up within a refit.
       looked_alike: number of effects asked for as most like what is unlisted beside a set, by form and effects.
+      renewed: form and effects of sets of which a further refit has found a better optimum.
     """
 
     forms: Sequence[Form]
@@ -204,6 +205,7 @@ class _Search:
     asked: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
     over: bool = False
     looked_alike: dict[tuple[str, frozenset[str]], int] = dataclasses.field(default_factory=dict)
+    renewed: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
 
     @property
     def may_refit(self) -> bool:
@@ -240,7 +242,7 @@ class _Search:
         best = max(listed, key=lambda h: h.log_posterior)
         # Before anything else beside a new name, the set without it from there: it may have found a better optimum.
         leads = max((h for h in listed if h.refitted), key=lambda h: h.log_posterior)
-        doubtful = [leads.effects - {e} for e in sorted(leads.effects - self.challenged(leads.form))]
+        doubtful = [leads.effects - {e} for e in sorted(leads.effects - self.challenged(leads))]
         if doubtful:
             self.refit(by_name[leads.form], doubtful[0], leads)
             provisional(self.ranked(False))
@@ -333,6 +335,7 @@ class _Search:
             # What was refitted without an effect of the set began at a worse optimum of it, and challenges nothing now.
             if estimated is not None and estimated.refitted and reached > estimated.log_posterior + BETTER:
                 self.begun = {b for b in self.begun if (b[0], b[2]) != key}
+                self.renewed.add(key)
             if estimated is not None and estimated.promise is not None and not made.failed:
                 self.hold(estimated.promise, self.known[form.name, listed])
         elif key not in self.done:
@@ -340,8 +343,14 @@ class _Search:
             self.done[key] = None
             self.reasons.append(f"{label}: no evidence around its refit")
 
-    def challenged(self, form: str) -> frozenset[str]:
-        """Effects beside a form without which some set was refitted from where the one with them had ended."""
+    def challenged(self, leads: Hypothesis) -> frozenset[str]:
+        """Effects of a refitted set without which some set was refitted from where the one with them had ended.
+
+        Of a set that has found a better optimum since: from where itself has ended.
+        """
+        form, own = leads.form, leads.effects
+        if (form, own) in self.renewed:
+            return frozenset(e for e in own if (form, own - {e}, own) in self.begun)
         return frozenset(e for name, less, more in self.begun if name == form and less < more for e in more - less)
 
     def hold(self, promise: Promise, reached: Hypothesis) -> None:
@@ -387,7 +396,7 @@ class _Search:
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
         leads = next((h for h in order if h.refitted), None)
-        unchallenged = leads.effects - self.challenged(leads.form) if leads else frozenset[str]()
+        unchallenged = leads.effects - self.challenged(leads) if leads else frozenset[str]()
         return ModelSearch(
             tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, unchallenged
         )
