@@ -387,8 +387,8 @@ def _next_to_add(diagnosis: Diagnosis, run: Run) -> list[str]:
     Names are said where they are sure; a model is grown to foresee. Of all single models the one of the terms that are
     more probable than not foresees best in the mean square (the median probability model, Barbieri & Berger 2004). It
     is made of the most probable contact law: there is no model without a law, so that keeping the old one is a choice
-    like any other. A law alone is exchanged where it is surely better. Something unlisted changes none of this: where it
-    acts, shares of the effects are not known, and their absence is no better guess.
+    like any other. A law alone is exchanged where it is surely better. Something unlisted changes none of this: beside
+    it shares of the effects are not known, and their absence is no better guess.
     """
     shares, instruments = diagnosis.inclusion, ("unlisted at ", "calibration")
     # Calibration belongs to the instruments of these logs, and not into a model for other drives.
