@@ -12,7 +12,7 @@ from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Term, shifted
-from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, _Search, search
+from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, search
 from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, TwoValleys, X, curve, measured
 
 
@@ -334,29 +334,3 @@ def test_an_effect_ten_times_its_nominal_size_is_rare_and_no_miracle():
     # A look at a few sizes picks about as well.
     looked = [one.at_sizes(terms, (sizes.tau, sizes.noise)) for one in (gaussian, cauchy)]
     assert looked[1] - looked[0] > 20.0
-
-
-def test_a_better_optimum_of_a_set_is_challenged_anew():
-    """A campaign of a Husky kept a wrong name: the set without it was refitted from 49 nats below where that ended."""
-    form = ToyForm(measured(0, wave=0.8))
-    under_way = _Search([form], 12, 4, 4.0, 1.0, 0.5, math.inf, lambda text, share: None)
-    under_way.begin()
-    wave = frozenset({"wave"})
-    place = form.name, form.listed(wave)
-    base = under_way.known[form.name, frozenset()]
-    under_way.refit(form, wave, base)
-    under_way.refit(form, frozenset(), under_way.known[place])
-    assert under_way.challenged(under_way.known[place]) == wave
-    under_way.refit(form, wave, base)
-    assert under_way.challenged(under_way.known[place]) == wave
-    # another set without it, from where that has ended, is no challenge of what comes now
-    both = frozenset({"wave", "square"})
-    under_way.refit(form, both, under_way.known[place])
-    under_way.refit(form, frozenset({"square"}), under_way.known[form.name, form.listed(both)])
-    # as if the first refit had ended further below
-    first = under_way.known[place]
-    under_way.known[place] = dataclasses.replace(first, log_posterior=first.log_posterior - 49.0)
-    under_way.refit(form, wave, base)
-    assert not under_way.challenged(under_way.known[place])
-    under_way.refit(form, frozenset(), under_way.known[place])
-    assert under_way.challenged(under_way.known[place]) == wave

@@ -35,8 +35,6 @@ unlisted input: it is undecidable, and keeps its prior probability without being
 FIRST_ALIKE = 2
 """Effects most like what is unlisted that are refitted beside one set before what else is promised: several are alike
 at one port."""
-BETTER = 1.0
-"""nat; gain by which a further refit of a set has found another optimum: less than that changes no ranking."""
 UNLISTED_SHARE = 0.5
 """Probability of something unlisted from which every effect that could be seen is refitted from where it acts: more
 probable than not."""
@@ -185,7 +183,6 @@ class _Search:
       asked: form and effects of sets beside which a doubted effect was refitted.
       over: whether time was up within a refit.
       looked_alike: number of effects asked for as most like what is unlisted beside a set, by form and effects.
-      renewed: form and effects of sets of which a further refit has found a better optimum.
     """
 
     forms: Sequence[Form]
@@ -205,7 +202,6 @@ class _Search:
     asked: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
     over: bool = False
     looked_alike: dict[tuple[str, frozenset[str]], int] = dataclasses.field(default_factory=dict)
-    renewed: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
 
     @property
     def may_refit(self) -> bool:
@@ -242,7 +238,7 @@ class _Search:
         best = max(listed, key=lambda h: h.log_posterior)
         # Before anything else beside a new name, the set without it from there: it may have found a better optimum.
         leads = max((h for h in listed if h.refitted), key=lambda h: h.log_posterior)
-        doubtful = [leads.effects - {e} for e in sorted(leads.effects - self.challenged(leads))]
+        doubtful = [leads.effects - {e} for e in sorted(leads.effects - self.challenged(leads.form))]
         if doubtful:
             self.refit(by_name[leads.form], doubtful[0], leads)
             provisional(self.ranked(False))
@@ -331,11 +327,6 @@ class _Search:
         estimated = self.known.get((form.name, listed))
         if self.score_around(form, made, near):
             self.done[key] = made
-            reached = self.known[form.name, listed].log_posterior
-            # What was refitted without an effect of the set began at a worse optimum of it, and challenges nothing now.
-            if estimated is not None and estimated.refitted and reached > estimated.log_posterior + BETTER:
-                self.begun = {b for b in self.begun if (b[0], b[2]) != key}
-                self.renewed.add(key)
             if estimated is not None and estimated.promise is not None and not made.failed:
                 self.hold(estimated.promise, self.known[form.name, listed])
         elif key not in self.done:
@@ -343,14 +334,8 @@ class _Search:
             self.done[key] = None
             self.reasons.append(f"{label}: no evidence around its refit")
 
-    def challenged(self, leads: Hypothesis) -> frozenset[str]:
-        """Effects of a refitted set without which some set was refitted from where the one with them had ended.
-
-        Of a set that has found a better optimum since: from where itself has ended.
-        """
-        form, own = leads.form, leads.effects
-        if (form, own) in self.renewed:
-            return frozenset(e for e in own if (form, own - {e}, own) in self.begun)
+    def challenged(self, form: str) -> frozenset[str]:
+        """Effects beside a form without which some set was refitted from where the one with them had ended."""
         return frozenset(e for name, less, more in self.begun if name == form and less < more for e in more - less)
 
     def hold(self, promise: Promise, reached: Hypothesis) -> None:
@@ -396,7 +381,7 @@ class _Search:
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
         leads = next((h for h in order if h.refitted), None)
-        unchallenged = leads.effects - self.challenged(leads) if leads else frozenset[str]()
+        unchallenged = leads.effects - self.challenged(leads.form) if leads else frozenset[str]()
         return ModelSearch(
             tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, unchallenged
         )
