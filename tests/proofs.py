@@ -68,16 +68,22 @@ def commit() -> str:
     return head[:10] + ("+" if changed.strip() else "")
 
 
-def turned(files: Sequence[str], at: str) -> list[str]:
-    """The files, beginning with another one for another commit."""
-    start = int(at.rstrip("+"), 16) % max(len(files), 1)
+def turned(files: Sequence[str], at: str, record: Mapping[str, Entry] | None = None) -> list[str]:
+    """The files, beginning with another one for another commit; the longer one takes, the more often with it.
+
+    Were each as often the first, one that takes half of the time there is would hardly ever find so much left.
+    """
+    times = [max(1, round((record or {}).get(file, {}).get("seconds", 1.0))) for file in files]
+    place, start = int(at.rstrip("+"), 16) % max(sum(times), 1), 0
+    while files and place >= times[start]:
+        place, start = place - times[start], start + 1
     return [*files[start:], *files[:start]]
 
 
 def in_turn(files: Sequence[str], record: Mapping[str, Entry], at: str) -> list[str]:
     """The order of a commit: files with a record, then those that were never recorded, each turned by the commit."""
     known = [f for f in files if f in record]
-    return [*turned(known, at), *turned([f for f in files if f not in record], at)]
+    return [*turned(known, at, record), *turned([f for f in files if f not in record], at)]
 
 
 def broken(failed: Sequence[str], record: Mapping[str, Entry], whole: bool) -> list[str]:
