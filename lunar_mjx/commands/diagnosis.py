@@ -256,7 +256,8 @@ def improve(
 ) -> None:
     """Run the whole loop unattended; the exit status is the last verdict.
 
-    Each round adds every effect that is more probable than not: that model foresees best. It ends where there is none.
+    Each round adds every effect that is more probable than not: that model foresees best. It ends where there is none,
+    or where the verdict is neither a name nor UNKNOWN.
     """
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress

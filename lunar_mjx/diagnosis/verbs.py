@@ -326,9 +326,9 @@ def improve(
     progress: Progress = silent,
     settings: Mapping[str, Any] | None = None,
 ) -> tuple[Diagnosis, list[Run]]:
-    """The whole loop unattended: compare, why, add, until nothing is more probable than not.
+    """The whole loop unattended: compare, why, add, while the verdict names something or is UNKNOWN.
 
-    What a round adds is every effect that is, where the verdict names something or is UNKNOWN.
+    What a round adds is every effect that is more probable than not. Where there is none the loop ends, too.
 
     Args:
       logs, model, effects, splits, seed, discrepancy, progress, settings: as for `compare`.
@@ -390,18 +390,17 @@ def _next_to_add(diagnosis: Diagnosis, run: Run) -> list[str]:
     like any other. A law alone is exchanged where it is surely better. Something unlisted changes none of this: beside
     it shares of the effects are not known, and their absence is no better guess.
     """
-    shares, instruments = diagnosis.inclusion, ("unlisted at ", "calibration")
     # Calibration belongs to the instruments of these logs, and not into a model for other drives.
-    named = [n for n in diagnosis.effects if not n.startswith(instruments)]
+    no_effects = ("unlisted at ", "calibration")
+    named = [n for n in diagnosis.effects if not n.startswith(no_effects)]
+    probable = [n for n, p in diagnosis.inclusion.items() if p > 0.5 and not n.startswith(no_effects)]
     sure = float(run.settings.get("sure", SearchSettings().sure))
     names: list[str] = []
     if diagnosis.verdict in (Verdict.KNOWN, Verdict.MULTIPLE):
-        names = list(
-            dict.fromkeys([*named, *(n for n, p in shares.items() if p > 0.5 and not n.startswith(instruments))])
-        )
+        names = [*dict.fromkeys([*named, *probable])]
     elif diagnosis.verdict is Verdict.UNKNOWN:
-        # of what helps beside it: what held-out drives have taken back is no longer among that
-        names = [n for n in named if shares.get(n, 0.0) > 0.5]
+        # what held-out drives have taken back is probable by the fitted ones, and none of the verdict's effects
+        names = [n for n in named if n in probable]
     names = [n for n in names if n not in run.model.effect_names]
     # Beside an effect any likelier law is taken; alone it must be sure, or rounds would swap laws to and fro.
     law = better_law(diagnosis.forms, run.model, 0.0 if names else sure)

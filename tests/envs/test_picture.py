@@ -13,7 +13,7 @@ from lunar_mjx.terrain import flat
 
 
 def test_wheel_tracks_grow_while_the_rover_drives(opengl: None) -> None:
-    """The same place with and without a way to it: behind the rover the ground is darker in two lines."""
+    """A picture of a rover that came along a way differs from one of a rover set down: two dark lines lie behind it."""
     rover = load_rover("viper")
     env: Any = SimpleNamespace(
         model=SimpleNamespace(rover=rover),

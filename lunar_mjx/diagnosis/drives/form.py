@@ -469,10 +469,10 @@ class DriveForm(MeasuredForm):
         return self._trial
 
     def _as_given(self) -> np.ndarray:
-        """(coordinates,) the model as given, but that what is nothing in it acts with half of what is usual.
+        """(coordinates,) where refits begin: the model as given, and parameters of `FROM_NOTHING` at half their prior.
 
-        From zero a creep has no slope while contact's other constants move, and a descent that began there ended there
-        (0.0004 m/s of 0.06 on a foreign campaign of a Husky, thousands of nats below).
+        At zero such a parameter has next to no slope while the other constants of contact move first, and a descent
+        that begins there may leave it there.
         """
         place = self.origin()
         for i in self.baseline:
