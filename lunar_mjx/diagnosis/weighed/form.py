@@ -188,26 +188,11 @@ class MeasuredForm(Form):
 
     def amounts(self, columns: int) -> np.ndarray:
         """(columns,) whether each is the amplitude of a coordinate, of which the first columns are."""
-        out = np.zeros(columns, bool)
-        out[: len(self.coordinates)] = [c.amplitude for c in self.coordinates]
-        return out
+        return amplitude_columns(self.coordinates, columns)
 
     def effect_std(self, u: np.ndarray, std: np.ndarray, freedom: float) -> np.ndarray:
-        """(coordinates,) prior standard deviations for a descent from (coordinates,), where effects have Student's t.
-
-        A Gaussian that is as wide as the amplitudes there are far draws them like the t distribution (EM: Lange et al.
-        1989). It is never narrower than the nominal one: a descent that begins at an effect's null says nothing of its
-        size.
-
-        Args:
-          u: the place. std: (coordinates,) nominal ones. freedom: of the distribution; 0 for a Gaussian.
-        """
-        out = std.copy()
-        for places in self.candidates.values() if freedom > 0.0 else ():
-            own = [i for i in places if self.coordinates[i].amplitude]
-            square = float(np.sum((u[own] / std[own]) ** 2))
-            out[own] *= max(1.0, math.sqrt((freedom + square) / (freedom + len(own))))
-        return out
+        """(coordinates,) prior standard deviations for a descent; see `students_std`."""
+        return students_std(self.coordinates, self.candidates, u, std, freedom)
 
     def origin(self) -> np.ndarray:
         """(coordinates,) the model as given."""
@@ -222,6 +207,38 @@ class MeasuredForm(Form):
     def residual(self, u: np.ndarray) -> np.ndarray:
         """(n,) whitened residuals, measured less predicted."""
         return self.observations.whiten(self.observations.value - self.predicted(u))
+
+
+def amplitude_columns(coordinates: Sequence[Coordinate], columns: int) -> np.ndarray:
+    """(columns,) whether each is the amplitude of a coordinate, of which the first columns are."""
+    out = np.zeros(columns, bool)
+    out[: len(coordinates)] = [c.amplitude for c in coordinates]
+    return out
+
+
+def students_std(
+    coordinates: Sequence[Coordinate],
+    candidates: Mapping[str, np.ndarray],
+    u: np.ndarray,
+    std: np.ndarray,
+    freedom: float,
+) -> np.ndarray:
+    """(coordinates,) prior standard deviations for a descent from (coordinates,), where effects have Student's t.
+
+    A Gaussian that is as wide as the amplitudes there are far draws them like the t distribution (EM: Lange et al.
+    1989). It is never narrower than the nominal one: a descent that begins at an effect's null says nothing of its
+    size.
+
+    Args:
+      coordinates: all of them. candidates: places by effect.
+      u: the place. std: (coordinates,) nominal ones. freedom: of the distribution; 0 for a Gaussian.
+    """
+    out = std.copy()
+    for places in candidates.values() if freedom > 0.0 else ():
+        own = [i for i in places if coordinates[i].amplitude]
+        square = float(np.sum((u[own] / std[own]) ** 2))
+        out[own] *= max(1.0, math.sqrt((freedom + square) / (freedom + len(own))))
+    return out
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
