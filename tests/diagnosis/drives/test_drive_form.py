@@ -16,9 +16,16 @@ from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.drives import form as module
 from lunar_mjx.diagnosis.drives import loop
 from lunar_mjx.diagnosis.drives.baseline import unfit
-from lunar_mjx.diagnosis.drives.form import DriveForm, _bounded_step
+from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.observations import observations_of
+from lunar_mjx.diagnosis.drives.refitting import signatures
+from lunar_mjx.diagnosis.drives.refitting.descent import Descent
+from lunar_mjx.diagnosis.drives.refitting.fields import USUAL_EFFECTS, Share
+from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
+from lunar_mjx.diagnosis.drives.refitting.own import OwnRefit
+from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.diagnosis.drives.usual import acting_current
 from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import DRIVEN, Usual, rotation
 from lunar_mjx.diagnosis.verbs import explain
@@ -216,7 +223,7 @@ def test_an_effect_is_named_beside_an_input_that_bends(monkeypatch, amount, bend
 @pytest.mark.parametrize("own", [0.0, 0.5, 1.0])
 def test_logs_share_what_the_settings_say(own):
     fitted = [True, True, False, True, False]
-    share = module._Share.of(own, fitted)
+    share = Share.of(own, fitted)
     mean = np.where(fitted, 1.0, share.known)
     covariance = share.mean * np.outer(mean, mean) + share.apart @ share.apart.T
     np.testing.assert_allclose(covariance, (1.0 - own) + own * np.eye(len(fitted)), atol=1e-12)
@@ -250,7 +257,7 @@ def test_derivatives_by_inputs_step_over_jumps():
     """Columns as steep as a jump over a short step made two of 21 foreign campaigns end with an error."""
     toy = Breakaway({"a": 0.5})
     form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
-    place, size = form.discrepancy[1:2], form._whole_size[1]
+    place, size = form.discrepancy[1:2], form._own.prior.whole_size[1]
 
     def off(jacobian) -> float:
         return float(np.abs(jacobian(form.origin(), place)[1][:, 0] - 20.0 * SHAPES[6]).max() * size)
@@ -309,7 +316,7 @@ def test_a_law_whose_own_refit_failed_is_asked_no_further(monkeypatch):
     def diverges(*_args, **_kwargs):
         raise EvidenceError("a rover's simulation diverged")
 
-    monkeypatch.setattr(rival, "_approach", diverges)
+    monkeypatch.setattr(rival._own, "approach", diverges)
     found = search([own, rival], settings.most_refits, settings.most_terms, settings.window)
     assert conclude(found, settings.sure).effects == ("lag",)
     assert found.failed == ("finer: a rover's simulation diverged",)
@@ -392,9 +399,9 @@ def test_a_step_ends_at_a_bound_and_the_others_do_their_best():
     normal = np.array([[2.0, 0.9], [0.9, 1.0]])
     downhill = normal @ [3.0, -1.0]
     low, high = np.array([-1.0, -5.0]), np.array([1.0, 5.0])
-    step = _bounded_step(normal, downhill, np.zeros(2), low, high)
+    step = bounded_step(normal, downhill, np.zeros(2), low, high)
     assert step == pytest.approx([1.0, (downhill[1] - 0.9) / 1.0])
-    assert _bounded_step(normal, downhill, np.zeros(2), -10.0 * high, 10.0 * high) == pytest.approx([3.0, -1.0])
+    assert bounded_step(normal, downhill, np.zeros(2), -10.0 * high, 10.0 * high) == pytest.approx([3.0, -1.0])
 
 
 def test_columns_are_turned_so_that_few_are_left():
@@ -422,7 +429,7 @@ def test_a_usual_current_is_what_acts_at_one_wheel():
         series = tuple(Series(0, c, 400 * i, 400 * (i + 1), time, 0.3, 0.4, 1.0) for i, c in enumerate(names))
         unit, split = np.zeros(1200, int), ("fit",)
         observations = Observations(scale * np.concatenate(values), series, ("a",), split, unit, split, ("a",))
-        return module.acting_current(observations, {"left": 2})
+        return acting_current(observations, {"left": 2})
 
     assert acting(1.0) == pytest.approx(3.0, rel=0.05)
     assert acting(0.1) == 0.0
@@ -458,7 +465,7 @@ class Hurried(Toy):
 
 
 def test_candidates_without_time_are_skipped_and_told(monkeypatch):
-    monkeypatch.setattr(module, "DRIVE_REFIT", dataclasses.replace(module.DRIVE_REFIT, together=1))
+    monkeypatch.setattr(signatures, "DRIVE_REFIT", dataclasses.replace(signatures.DRIVE_REFIT, together=1))
     toy = Hurried({"a": 0.5, "drag": 0.9})
     toy.late = "lag"
     form, _, said = asked(toy)
@@ -535,7 +542,7 @@ def test_a_name_without_its_challenge_is_none():
 
 
 def test_an_estimate_is_no_name_where_candidates_were_skipped_as_well(monkeypatch):
-    monkeypatch.setattr(module, "DRIVE_REFIT", dataclasses.replace(module.DRIVE_REFIT, together=1))
+    monkeypatch.setattr(signatures, "DRIVE_REFIT", dataclasses.replace(signatures.DRIVE_REFIT, together=1))
     toy = Hurried({"a": 0.5, "drag": 0.9})
     toy.late, toy.refits_too = "lag", True
     form, found, _ = asked(toy)
@@ -577,7 +584,7 @@ def test_a_little_of_everything_is_no_name():
     _, found, said = asked(toy)
     assert said.verdict is Verdict.NOISE_ONLY, said.sentence
     base = found.base("the model")
-    (field,) = [i for i, f in enumerate(base.refit.linear.fields) if f.name == module.USUAL_EFFECTS]
+    (field,) = [i for i, f in enumerate(base.refit.linear.fields) if f.name == USUAL_EFFECTS]
     assert 0.01 < base.evidence.tau[field] < 0.3
 
 
@@ -661,7 +668,7 @@ def test_readings_that_are_far_off_have_errors_of_their_own():
     assert abs(base.u[1] - calm.u[1]) < 0.06
 
     def usual_width(form, refit):
-        noise = refit.linear.evidence(frozenset())[1].noise[form._group]
+        noise = refit.linear.evidence(frozenset())[1].noise[form._errors.group]
         return np.median((noise * form.observations.sigma() / toy.observations.sigma())[~off])
 
     # normal noise has to be wide for all readings, where a few are far off
@@ -673,11 +680,11 @@ def test_a_descent_is_led_by_sizes_that_are_usual_at_most():
     form = DriveForm(Toy({"a": 1.5}, unlisted=1.0), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
     found = base.linear.evidence(frozenset())[1]
-    usual = np.array([f.usual for f in form._usual_fields()])
+    usual = form._own.prior.fields.usual
     assert np.max(found.tau / usual) > 3.0
-    assert form._sizes is not None
-    assert np.all(form._sizes[0] <= usual)
-    np.testing.assert_allclose(form._sizes_of(base)[0], np.minimum(found.tau, usual))
+    assert form._refits.base is not None
+    assert np.all(form._refits.base.sizes[0] <= usual)
+    np.testing.assert_allclose(form._refits.sizes_of(base)[0], np.minimum(found.tau, usual))
 
 
 class Turning(Toy):
@@ -722,17 +729,17 @@ def test_signatures_are_those_of_where_the_refit_has_ended():
     toy = Coupled({"a": 1.5, "b": -0.8})
     form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
-    assert form._seen is not None
     there = form.jacobian(base.u, np.array([2]))[1][:, 0]
+    seen = form._own.design.seen[:, 2]
     # a secant is up to a fifth shorter, as the toy's drag saturates; where the refit began both have two fifths of that
-    assert form._seen[:, 2] @ there / (there @ there) == pytest.approx(0.9, abs=0.13)
+    assert seen @ there / (there @ there) == pytest.approx(0.9, abs=0.13)
 
 
 def test_a_jump_at_nothing_of_an_effect_is_no_slope():
     form = DriveForm(Toy({}), DriveSettings())  # type: ignore[arg-type]
     slopes, secants = np.ones((len(form.observations), 1)), np.ones((len(form.observations), 1))
     slopes[7] = 1e6
-    found = form._tamed(np.array([2]), slopes, secants)[0]
+    found = form._signatures._tamed(np.array([2]), slopes, secants)[0]
     assert found[7] == 1.0
     assert np.all(found == 1.0)
 
@@ -750,7 +757,7 @@ def test_a_refit_that_was_kept_is_not_made_again():
     np.testing.assert_allclose(other.u, base.u, atol=0.1)
     told = again.learnt(other)
     assert told["log_evidence"] == pytest.approx(learnt["log_evidence"], abs=1.0)
-    assert {k: told[k] for k in module.LEARNT} == {k: learnt[k] for k in module.LEARNT}
+    assert {k: told[k] for k in LEARNT} == {k: learnt[k] for k in LEARNT}
 
 
 def test_a_refit_with_errors_that_are_tried_no_more_is_made_again():
@@ -781,9 +788,9 @@ def test_a_secant_speaks_of_amounts_as_large_as_its_own_alone():
     """Where little of an effect is asked for, its slope stands: a secant beside it would be one more freedom."""
     form = DriveForm(Toy({"drag": 0.02}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
-    slope, secant = (form.jacobian(base.u, np.array([2]))[1][:, 0], form._secants[:, 2])  # type: ignore[index]
+    slope, secant = (form.jacobian(base.u, np.array([2]))[1][:, 0], form._signatures.secants[:, 2])
     assert np.linalg.norm(secant) < 0.95 * np.linalg.norm(slope)
-    np.testing.assert_allclose(form._seen[:, 2], slope, rtol=1e-3)  # type: ignore[index]
+    np.testing.assert_allclose(form._own.design.seen[:, 2], slope, rtol=1e-3)
 
 
 def test_no_estimate_goes_beyond_what_a_parameter_can_be():
@@ -806,8 +813,9 @@ def test_an_effect_is_credited_with_what_its_refit_has_reached():
     refit = form.refit(drag, base, None)
     assert 0.0 <= refit.linear.unkept < form.settings.settled
     away = refit.u + np.eye(len(refit.u))[0]
-    slopes = form.jacobian(away, form._free(drag))[1]
-    lavish, plain = (form._linear(away, drag, slopes, k).evidence(form.listed(drag))[0] for k in (7.0, 0.0))
+    slopes = form.jacobian(away, form._own.prior.places.free(drag))[1]
+    linear = form._refits.linearised
+    lavish, plain = (linear.around(away, drag, slopes, k).evidence(form.listed(drag))[0] for k in (7.0, 0.0))
     assert lavish == pytest.approx(plain - 7.0)
 
 
@@ -815,12 +823,13 @@ def test_slopes_of_a_place_do_not_change_what_is_told_of_it():
     """Slopes across jumps, where wheels stick, differ at random; what hypotheses are weighed by must not."""
     form = DriveForm(Rough({"a": 1.5, "b": -0.8}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
-    free = form._free(frozenset())
-    framed, own = [], []
+    free, refits, framed, own = form._own.prior.places.free(), form._refits, [], []
+    assert refits.base is not None
+    sizes = refits.base.sizes
     for step in np.linspace(3e-4, 3e-3, 8):
         slopes = form.drives.jacobian(base.u, free, steps=np.full(len(base.u), step))[1]
-        framed.append(form._reached(base.u, frozenset(), free, slopes).evidence(frozenset(), form._sizes)[0])
-        own.append(form._linear(base.u, frozenset(), slopes).evidence(frozenset(), form._sizes)[0])
+        framed.append(refits.reached(base.u, frozenset(), free, slopes).evidence(frozenset(), sizes)[0])
+        own.append(refits.linearised.around(base.u, frozenset(), slopes).evidence(frozenset(), sizes)[0])
     assert np.ptp(framed) < 1e-9
     assert np.ptp(own) > 1.0
 
@@ -829,9 +838,9 @@ def test_a_refit_begins_where_the_model_itself_is_best():
     """An estimate that leads far from what it was made around is not where its refit begins."""
     form = DriveForm(Toy({"a": 0.8, "drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
-    free, far = form._free(frozenset({"drag"})), base.u.copy()
+    free, far = form._own.prior.places.free(frozenset({"drag"})), base.u.copy()
     far[:3] = 4.0, -3.0, 0.5
-    begun = form._better_start(far, base, free)
+    begun = form._refits.better_start(far, base, free)
     np.testing.assert_array_equal(begun[:2], base.u[:2])
     assert begun[2] == 0.5
 
@@ -839,13 +848,12 @@ def test_a_refit_begins_where_the_model_itself_is_best():
 def test_what_is_usual_has_none_of_an_effect_that_was_refitted():
     form = DriveForm(Toy({"drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
     form.refit(frozenset(), None, None)
-    usual = form._number[module.USUAL_EFFECTS]
-    drag = form._seen[:, 2]  # type: ignore[index]
+    usual, design = form._own.prior.fields.number[USUAL_EFFECTS], form._own.design
+    drag = design.seen[:, 2]
 
     def left(effects: frozenset[str]) -> float:
         """Share of the effect's signature that the columns of usual effects cannot give."""
-        inputs = form._seen[:, form.discrepancy]  # type: ignore[index]
-        columns, number = form._field_columns(form.observations, inputs, effects)
+        columns, number = design.fields(design.seen[:, form.discrepancy], effects)
         mine = columns[:, number == usual]
         return float(np.linalg.norm(drag - mine @ np.linalg.lstsq(mine, drag, rcond=None)[0]) / np.linalg.norm(drag))
 
@@ -861,27 +869,29 @@ def test_a_run_s_record_holds_every_setting():
 
 def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
     """What was reached before stands where slopes at the end of a round are too steep to compute with."""
-    form = DriveForm(Toy({"a": 1.5, "b": -0.8}), DriveSettings())  # type: ignore[arg-type]
-    looked, learn = [], DriveForm._learn_errors
+    toy = Toy({"a": 1.5, "b": -0.8})
+    candidates, toy.candidates = toy.candidates, {}
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    looked, learn = [], OwnRefit.learn
 
-    def steep(self, u, free, slopes):
+    def steep(self, u, *rest):
         looked.append(u)
         if len(looked) == 3:
             raise EvidenceError("derivatives are too steep to compute with")
-        return learn(self, u, free, slopes)
+        return learn(self, u, *rest)
 
-    monkeypatch.setattr(DriveForm, "_learn_errors", steep)
-    starts, descend = [], DriveForm._descend
-    monkeypatch.setattr(
-        DriveForm, "_descend", lambda self, u, *a, **k: (starts.append(u), descend(self, u, *a, **k))[1]
-    )
-    candidates, form.candidates = form.candidates, {}
-    base = form.refit(frozenset(), None, None)
-    form.candidates = candidates
+    starts, descend = [], Descent.descend
+    with monkeypatch.context() as patched:
+        patched.setattr(OwnRefit, "learn", steep)
+        patched.setattr(Descent, "descend", lambda self, u, *a, **k: (starts.append(u), descend(self, u, *a, **k))[1])
+        form.refit(frozenset(), None, None)
     # the first descent is that of the instruments
     assert len(looked) == 3 and np.allclose(starts[1], looked[1], atol=1e-8)
     assert not np.allclose(starts[1], looked[2], atol=1e-3)
-    told, linear = [], DriveForm._linear
+    toy.candidates = candidates
+    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    told, linear = [], Linearised.around
 
     def steep_again(self, u, *rest):
         told.append(u)
@@ -889,6 +899,6 @@ def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
             raise EvidenceError("derivatives are too steep to compute with")
         return linear(self, u, *rest)
 
-    monkeypatch.setattr(DriveForm, "_linear", steep_again)
+    monkeypatch.setattr(Linearised, "around", steep_again)
     refit = form.refit(frozenset({"drag"}), base, None)
     assert len(told) == 2 and refit.u is told[0]

@@ -7,6 +7,8 @@ import pytest
 
 import lunar_mjx.diagnosis.drives.form as module
 from lunar_mjx.diagnosis.drives.form import DriveForm
+from lunar_mjx.diagnosis.drives.refitting import prior
+from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step, promise_left, promised
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from tests.diagnosis.drives.test_drive_form import USUAL, Toy
 
@@ -32,18 +34,19 @@ def test_a_step_within_bounds_that_leads_uphill_is_no_promise():
     normal = np.array([[29.0, 23.0, -4.0], [23.0, 22.0, 3.0], [-4.0, 3.0, 27.0]])
     downhill, low, high = np.array([-4.0, 5.0, -8.0]), np.array([0.0, -2.0, 0.0]), np.array([3.0, 4.0, 4.0])
     within = normal, downhill, np.zeros(3), low, high
-    assert module._promised(module._bounded_step(*within), normal, downhill) < -100.0
-    assert module._promise_left(*within) == 0.0
+    assert promised(bounded_step(*within), normal, downhill) < -100.0
+    assert promise_left(*within) == 0.0
     far = np.full(3, 1e9)
     best = downhill @ np.linalg.solve(normal, downhill)
-    assert module._promise_left(normal, downhill, np.zeros(3), -far, far) == pytest.approx(best)
+    assert promise_left(normal, downhill, np.zeros(3), -far, far) == pytest.approx(best)
 
 
 def test_a_trial_begins_where_its_effect_acts(monkeypatch):
     """Even where the model is better without it: at its null it may have no slope."""
     form = DriveForm(Toy({"a": 0.8}), DriveSettings())  # type: ignore[arg-type]
-    base, begun, descend = form.refit(frozenset(), None, None), [], form._descend
-    monkeypatch.setattr(form, "_descend", lambda u, *rest, **more: (begun.append(u[2]), descend(u, *rest, **more))[1])
+    base, begun, descent = form.refit(frozenset(), None, None), [], form._refits.descent
+    descend = descent.descend
+    monkeypatch.setattr(descent, "descend", lambda u, *rest, **more: (begun.append(u[2]), descend(u, *rest, **more))[1])
     start = form.trial(base.u, "drag")
     form.refit(frozenset({"drag"}), base, start)
     form.refit(frozenset({"drag"}), base, start.copy())
@@ -53,7 +56,7 @@ def test_a_trial_begins_where_its_effect_acts(monkeypatch):
 
 def test_what_is_nothing_in_a_model_begins_where_it_acts(monkeypatch):
     """At zero it has no slope, and a descent would leave it there."""
-    monkeypatch.setattr(module, "FROM_NOTHING", {"base": {"b": (0.01, 5.0, 0.3)}})
+    monkeypatch.setattr(prior, "FROM_NOTHING", {"base": {"b": (0.01, 5.0, 0.3)}})
     toy = Toy({"a": 0.8})
     assert toy.coordinates[1].start == 0.0
     form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""Refits of a rover's model against drives: priors, errors of measurements, derivatives, descents."""

@@ -1,0 +1,219 @@
+"""Refits of a form of drives with effects, all weighed with what the refit of the model as it is has found."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from lunar_mjx.diagnosis.drives.problem import DriveProblem
+from lunar_mjx.diagnosis.drives.refitting.descent import Descent
+from lunar_mjx.diagnosis.drives.refitting.design import Design
+from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel
+from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
+from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
+from lunar_mjx.diagnosis.drives.refitting.own import Base
+from lunar_mjx.diagnosis.drives.refitting.prior import Prior
+from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
+from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.inference.evidence import EvidenceError
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Refit, Term
+
+
+@dataclasses.dataclass(eq=False)
+class Refits:
+    """Refits around that of the model as it is.
+
+    Attributes:
+      drives: simulation. design: derivatives. linearised: what hypotheses need. descent: within bounds.
+      prior: of what moves. errors: of the readings. terms: everything that may be the matter. settings: effort.
+      base: the refit of the model as it is by itself; None before.
+      ended: (coordinates,) where that refit has ended.
+      slopes: coordinates and derivatives (n, free) by them at the end of each refit, by its effects.
+    """
+
+    drives: DriveProblem
+    design: Design
+    linearised: Linearised
+    descent: Descent
+    prior: Prior
+    errors: ErrorModel
+    terms: Sequence[Term]
+    settings: DriveSettings
+    base: Base | None = None
+    ended: np.ndarray | None = None
+    slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+
+    def begin(self, base: Base) -> tuple[np.ndarray, Linear]:
+        """Where (coordinates,) the model as it is ends from its own refit, and what hypotheses need there.
+
+        Args:
+          base: its own refit. The time may cut what follows short.
+
+        Raises:
+          EvidenceError: nothing can be told of that place.
+        """
+        self.base, self.ended = base, base.u
+        self.slopes[frozenset()] = base.free, base.slopes
+        u, linear = self._refit(frozenset(), None, base.u, whole=False)
+        self.ended = u
+        return u, linear
+
+    def refit(
+        self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None, trial: bool = False
+    ) -> tuple[np.ndarray, Linear]:
+        """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
+
+        Args:
+          effects, near, start: as for `Form.refit`. trial: whether an effect acts at the start whatever that costs.
+
+        Raises:
+          EvidenceError: nothing can be told of where it begins. TimeUp: before the refit had ended.
+        """
+        return self._refit(effects, near, start, trial)
+
+    def _refit(
+        self,
+        effects: frozenset[str],
+        near: Refit | None,
+        start: np.ndarray | None,
+        trial: bool = False,
+        whole: bool = True,
+    ) -> tuple[np.ndarray, Linear]:
+        """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
+
+        Args:
+          effects, near, start, trial: as for `refit`. whole: whether a descent that the time cuts short is none.
+        """
+        assert self.base is not None
+        free = self.prior.places.free(effects)
+        u = self._start(free, near, start)
+        # A trial begins where its effect acts, whatever that costs: at its null it may have no slope.
+        if near is not None and start is not None and not trial:
+            u = self.better_start(u, near, free)
+        slopes = self._guess(free, near)
+        terms, sizes = self._listed(effects), self.base.sizes if near is None else self.sizes_of(near)
+        best: tuple[float, np.ndarray, np.ndarray, Linear] | None = None
+        for number in range(self.settings.most_rounds):
+            guessed = number == 0 and bool(effects)
+            u, slopes = self.descent.descend(u, free, sizes, self._base_inputs, slopes, guessed=guessed, whole=whole)
+            try:
+                linear = self.reached(u, effects, free, slopes)
+                value, found, _ = linear.evidence(terms, sizes)
+            except EvidenceError:
+                # A place of which nothing can be told is not gone to; the one before it stands.
+                if best is None:
+                    raise
+                break
+            gained = math.inf if best is None else value - best[0]
+            if best is None or gained > 0.0:
+                best = value, u, slopes, linear
+            if gained < self.settings.settled:
+                break
+            sizes = self.prior.fields.led_by((found.tau, found.noise))
+        assert best is not None
+        _, u, slopes, linear = best
+        self.slopes[effects] = free, slopes
+        return u, linear
+
+    def _start(self, free: np.ndarray, near: Refit | None, start: np.ndarray | None) -> np.ndarray:
+        """(coordinates,) where a refit begins that moves some coordinates: at the start, or else at a similar refit."""
+        assert self.ended is not None
+        u = self.prior.places.origin()
+        u[self.drives.ground] = self.ended[self.drives.ground]
+        given = start if start is not None else None if near is None else near.u
+        if given is not None:
+            u[free] = given[free]
+        low, high = self.drives.bounds(free)
+        u[free] = np.clip(u[free], low + DRIVE_REFIT.inside, high - DRIVE_REFIT.inside)
+        return u
+
+    def better_start(self, start: np.ndarray, near: Refit, free: np.ndarray) -> np.ndarray:
+        """(coordinates,) of a linear estimate's place, the refit around which it was made, and that refit with the
+        estimate's effects alone, the one that the model itself likes best.
+
+        A linear estimate moves soil and starts of logs along slopes that do not hold so far: of a foreign LUVMI-X whose
+        IMU is off, refits from the estimate's place ended 25 nats below those from the refit around which it was made.
+
+        Args:
+          start: (coordinates,) the estimate's place. near: the refit. free: coordinates that are moved.
+        """
+        # What that refit has and this set has not stays at its null: a set is told by what it has alone.
+        there, (low, high) = start.copy(), self.drives.bounds(free)
+        there[free] = np.clip(near.u[free], low, high)
+        rows = np.stack([start, there, there])
+        own = np.setdiff1d(free, self.prior.places.free())
+        rows[2, own] = start[own]
+        cost = self.descent.cost(near.u, free, self.sizes_of(near), self._base_inputs)
+        return self.descent.least(cost, rows, free)
+
+    def _guess(self, free: np.ndarray, near: Refit | None) -> np.ndarray:
+        """(n, free) derivatives as far as they are known: those of a similar refit, and signatures of what is new."""
+        known = self.design.seen.copy()
+        places, slopes = self.slopes[frozenset() if near is None else near.effects]
+        known[:, places] = slopes
+        return known[:, free]
+
+    def reached(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
+        """What hypotheses need around the place of a refit, all with one discrepancy: that of the model as it is.
+
+        Derivatives of all but the effects' own are those at the base. They jump from one place to the next, so that two
+        places which predict alike would have evidences hundreds of nats apart. What derivatives promise beyond the
+        place by the sizes that led the descent, and no step has kept, is credited to none, but for so little that no
+        further step was asked for it. What larger discrepancy would explain is credited to all alike, as far as
+        derivatives tell it.
+
+        Args:
+          u: the place. effects: of the refit. free, slopes: as for `Descent.descend`.
+
+        Raises:
+          EvidenceError: nothing can be told of that place.
+        """
+        assert self.base is not None
+        framed, own = slopes.copy(), np.isin(free, self.base.free)
+        framed[:, own] = self.base.slopes
+        linear = self.linearised.around(u, effects, framed)
+        found = linear.evidence(self._listed(effects), self.base.sizes)[1]
+        sizes = self.prior.fields.led_by((found.tau, found.noise))
+        cost = self.descent.cost(u, free, sizes, self._base_inputs)
+        promise = self.descent.promise(cost, u, free, framed)
+        return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
+
+    def alone(self, refit: Refit) -> np.ndarray:
+        """(coordinates,) where the model alone predicts the fitted measurements best; from the refit's parameters and
+        from those as given.
+
+        A refit that leaves much to discrepancy may predict worse without it than the model as given does.
+        """
+        places, errors, std = self.prior.places, self.errors, self.prior.std
+        free = self.slopes[refit.effects][0]
+        free = free[self.prior.field_of[free] < 0]
+        fitted = places.bare(refit.u)
+        given = fitted.copy()
+        given[[i for i in places.baseline if not places.coordinates[i].nuisance]] = 0.0
+        centre = places.centres(free)
+
+        def cost(u: np.ndarray) -> float:
+            left = errors.observations.whiten(errors.observations.value - self.drives.predict(u[None])[0])[errors.fit]
+            # a simulation that diverged is no candidate
+            return float(np.nan_to_num(left @ left, nan=np.inf) + np.sum(((u[free] - centre) / std[free]) ** 2))
+
+        starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
+        whole = bool(refit.effects)
+        return min((self.descent.descend(u, free, once=True, whole=whole)[0] for u in starts), key=cost)
+
+    def sizes_of(self, near: Refit) -> Sizes:
+        """Sizes of discrepancy (fields,) and of noise (groups,) of a refit, as they lead a descent."""
+        found = near.linear.evidence(self._listed(near.effects))[1]
+        return self.prior.fields.led_by((found.tau, found.noise))
+
+    @property
+    def _base_inputs(self) -> np.ndarray | None:
+        """(n, discrepancy) derivatives at the base; None where it has not been refitted."""
+        return None if self.base is None else self.prior.places.inputs(self.base.free, self.base.slopes)
+
+    def _listed(self, effects: frozenset[str]) -> frozenset[Term]:
+        """The terms of some effects."""
+        return frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
