@@ -8,8 +8,11 @@ from lunar_mjx.inference.fitting import Fit
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import Problem
 
+MOST_BLOCKS = 400
+"""Blocks of all logs together at most, but for the four that each log may have."""
 
-def blocks(observations: Observations, residual: np.ndarray, keep: np.ndarray, most: int = 400) -> np.ndarray:
+
+def blocks(observations: Observations, residual: np.ndarray, keep: np.ndarray) -> np.ndarray:
     """Numbers the blocks over which scores are summed: stretches of at least five correlation times of one log.
 
     Points of a table form blocks of neighbours of all quantities in one group. Channels of a log share their blocks, so
@@ -29,7 +32,7 @@ def blocks(observations: Observations, residual: np.ndarray, keep: np.ndarray, m
         first = min(float(np.asarray(s.time)[0]) for s in timed)
         last = max(float(np.asarray(s.time)[-1]) for s in timed)
         tau = max([_correlation_time(residual[s.start : s.stop], np.asarray(s.time)) for s in timed], default=0.0)
-        length = max(5.0 * tau, (last - first) / max(4, most // max(1, len(observations.logs))), 1e-9)
+        length = max(5.0 * tau, (last - first) / max(4, MOST_BLOCKS // max(1, len(observations.logs))), 1e-9)
         # Whole blocks only: a short one at the end would be noisier than the others.
         pieces = max(1, int((last - first) / length))
         edges = np.linspace(first, last, pieces + 1)[1:-1]

@@ -301,7 +301,7 @@ class _Search:
         self.progress(f"refitting {label}", self.refits / self.most_refits)
         start, key = None, (form.name, effects)
         if near is not None:
-            start = _start(near, form)
+            start = _start(near)
             self.begun.add((*key, near.refit.effects))
         if trial and start is not None:
             start = form.trial(start, trial)
@@ -563,8 +563,8 @@ def _one_more(h: Hypothesis, best: Hypothesis) -> bool:
     return h.form == best.form and best.terms <= h.terms and len(more) == 1 and len(h.effects) > len(best.effects)
 
 
-def _start(near: Hypothesis, form: Form) -> np.ndarray:
-    """Where a hypothesis scored in linear approximation stands by its own posterior."""
+def _start(near: Hypothesis) -> np.ndarray:
+    """(coordinates,) where a hypothesis scored in linear approximation stands by its own posterior."""
     u = near.refit.u.copy()
     # beyond the coordinates lie the amplitudes of unlisted inputs, which are integrated out and have no place in u
     own = near.places < len(u)

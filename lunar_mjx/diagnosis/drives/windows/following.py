@@ -26,7 +26,6 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.inference.changes import Amounts, ChangeDetector, Restlessness, Step, learn
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.logs import Log
-from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
 
 MOST_LEARNT = 400
@@ -89,12 +88,11 @@ class Follower:
         found = cut([log], self._joints, self._radius, 10**9, 0, self._track, self.interval_s)
         return found.part(np.argsort(found.start_s, kind="stable"))
 
-    def form(self, found: Cut, log: Log, model: Model | None = None) -> WindowForm:
+    def form(self, found: Cut, log: Log) -> WindowForm:
         """The fitted model against windows of one drive, without anything missing."""
-        model = self.model if model is None else model
-        problem = WindowProblem(found, model, None, silent)
+        problem = WindowProblem(found, self.model, None, silent)
         splits = np.full(len(found), "fit")
-        base = baseline(model, found.channels, [log])
+        base = baseline(self.model, found.channels, [log])
         return WindowForm(
             lambda _: problem, base, (), observe(problem, self.noise, [log.name], splits), WindowSettings()
         )
