@@ -71,6 +71,29 @@ def test_a_log_without_noise_or_attitude_passes(tmp_path: Path) -> None:
     assert check(make_log(tmp_path / "a", change, noise={})) == []
 
 
+def test_a_gyroscope_with_a_zero_of_its_own_passes_and_a_frozen_angle_does_not(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+
+    def straight(tables: Tables) -> None:
+        table = next(t for t in tables.values() if "gyro_z_rad_s" in t)
+        # a rover that does not turn, and a gyroscope that says 17 deg/s of it all the time
+        table["gyro_z_rad_s"] = 0.3 + 0.002 * rng.standard_normal(len(table))
+        table["yaw_deg"] = 0.1 * rng.standard_normal(len(table))
+
+    def frozen(tables: Tables) -> None:
+        table = next(t for t in tables.values() if "yaw_deg" in t)
+        table["yaw_deg"] = 0.1 * rng.standard_normal(len(table))
+
+    def without_quaternion(tables: Tables) -> None:
+        for name, table in tables.items():
+            tables[name] = table.drop(columns=[c for c in table if c.startswith("quaternion")])
+
+    passed = check_frames(make_log(tmp_path / "a", both(without_quaternion, straight)))
+    assert not [f for f in passed if f.kind == "stuck"]
+    found = check_frames(make_log(tmp_path / "b", both(without_quaternion, frozen)))
+    assert [f for f in found if f.kind == "stuck" and f.column == "yaw_deg"], found
+
+
 def swap(*pairs: tuple[str, str]) -> Callable[[Tables], None]:
     def change(tables: Tables) -> None:
         for a, b in pairs:

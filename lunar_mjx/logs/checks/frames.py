@@ -221,8 +221,13 @@ def _gravity(log: Log) -> list[Finding]:
     return []
 
 
-def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Agreement | None:
-    """How the increments of a channel follow the integral of its rate (times `scale`) over windows of the log."""
+def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0, zero_known: bool = True) -> Agreement | None:
+    """How the increments of a channel follow the integral of its rate (times `scale`) over windows of the log.
+
+    Args:
+      log: which holds both. integral, rate: channels. scale: unit of the integral over that of the rate.
+      zero_known: whether a constant rate counts; else both are compared about their means.
+    """
     limits = span(log, (integral, rate))
     if limits is None:
         return None
@@ -231,8 +236,12 @@ def rate_agreement(log: Log, integral: str, rate: str, scale: float = 1.0) -> Ag
     # Noise of a sum over a window at 20 Hz: the root of its length by the step.
     noise = sigma(log, integral) + abs(scale) * sigma(log, rate) * np.sqrt(length * 0.05)
     expected = scale * integrals(log, rate, windows, like=integral)
-    least = LEAST[sensor_of(integral)]
-    return agreement(increments(log, integral, windows), expected, noise, least)
+    moved, least = increments(log, integral, windows), LEAST[sensor_of(integral)]
+    if not zero_known:
+        both = np.isfinite(moved) & np.isfinite(expected)
+        if both.any():
+            moved, expected = moved - moved[both].mean(), expected - expected[both].mean()
+    return agreement(moved, expected, noise, least)
 
 
 def _velocities(log: Log) -> list[Finding]:
@@ -320,8 +329,7 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
                     f"as fast{guess(own.factor)}; correct one of the two",
                 )
             )
-        # No movement where its rate lets expect some: a stuck channel has no cosine to speak of.
-        elif abs(own.cosine) < FRAME_LIMITS.unlike and own.series < 0.2 * own.reference:
+        elif _stuck(own) and _stuck(rate_agreement(log, integral, rate, scale, zero_known=sensor_of(rate) != "gyro")):
             findings.append(
                 _finding(
                     log,
@@ -332,6 +340,14 @@ def _paired(log: Log, pairs: dict[str, tuple[str, str]], what: str, scale: float
                 )
             )
     return findings
+
+
+def _stuck(pair: Agreement | None) -> bool:
+    """Whether a channel does not move where its rate lets expect it: it has no cosine to speak of.
+
+    A gyroscope's zero is off by what nobody knows: a rate that never changes tells of its zero, and of no movement.
+    """
+    return pair is not None and abs(pair.cosine) < FRAME_LIMITS.unlike and pair.series < 0.2 * pair.reference
 
 
 def _alike(pair: Agreement | None) -> bool:
