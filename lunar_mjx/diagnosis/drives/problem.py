@@ -15,7 +15,7 @@ import numpy as np
 from lunar_mjx.diagnosis.candidates import usable
 from lunar_mjx.diagnosis.contact_laws import no_addition
 from lunar_mjx.diagnosis.drives.baseline import BASELINE, baseline_coordinates, unfit
-from lunar_mjx.diagnosis.drives.differences import Differences
+from lunar_mjx.diagnosis.drives.differences import Differences, flatter
 from lunar_mjx.diagnosis.drives.instruments import (
     USUAL,
     instrument_direction,
@@ -39,7 +39,7 @@ from lunar_mjx.diagnosis.drives.nuisances import (
 from lunar_mjx.diagnosis.drives.observations import observations_of, with_discrepancy
 from lunar_mjx.diagnosis.drives.simulation.log_run import STOOD
 from lunar_mjx.diagnosis.drives.simulation.program import Rows
-from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench, at_once
+from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench, at_once, jumps
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import Key, Simulated, keys_of_rows, stamp_of_observations
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import ground_coordinates
 from lunar_mjx.diagnosis.drives.unused import unused_sentence
@@ -264,28 +264,39 @@ class DriveProblem:
 
     @property
     def rate(self) -> np.ndarray:
-        """(n,) change of the predictions by time, 1/s, over a simulated sample each way, at the place of `about`."""
+        """(n,) change of the predictions by time, unit/s, over a simulated sample, at the place of `about`."""
         if self._rate is None:
             found = self._rate_there()
             self._rate = np.where(np.isfinite(found), found, 0.0)
         return self._rate
 
     def _rate_there(self) -> np.ndarray:
-        sides = []
+        """(n,) change over a sample each way; of what jumps with a command, over the sample where it changes less.
+
+        A jump is no slope: a current that was read before a command is no other where its clock is a millisecond off.
+        (The mean of both ways made 3 A of 4 ms at every jump of a Husky's commands, where its fit then left 60 sigma
+        and held two other parameters at their bounds.)
+        """
         bench = self._there
         interval = [run.every * run.model.timestep for run in bench.runs]
-        for side in (-1.0, 1.0):
+
+        def sampled(side: float) -> np.ndarray:
             series = [
                 dataclasses.replace(s, time=np.asarray(s.time) + side * interval[s.log])
                 for s in self.observations.series
             ]
             at = dataclasses.replace(self.observations, series=tuple(series))
             simulated = self._run(bench, 1, self._values(self._reference[None]), silent, at)
-            sides.append(from_first(simulated, self.observations)[0])
-        apart = np.empty(len(self.observations))
+            return from_first(simulated, self.observations)[0]
+
+        before, there, after = (sampled(side) for side in (-1.0, 0.0, 1.0))
+        rate = 0.5 * (after - before)
         for s in self.observations.series:
-            apart[s.start : s.stop] = 2.0 * interval[s.log]
-        return (sides[1] - sides[0]) / apart
+            part = slice(s.start, s.stop)
+            if jumps(s.channel):
+                rate[part] = flatter(there[part] - before[part], after[part] - there[part])
+            rate[part] /= interval[s.log]
+        return rate
 
     @property
     def step_error(self) -> np.ndarray:

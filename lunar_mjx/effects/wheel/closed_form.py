@@ -210,7 +210,7 @@ def _remembered_slip(x, contact):
     relaxation=Parameter(
         1.0,
         None,
-        (0.01, 10.0),
+        (0.001, 10.0),
         "1",
         "rolling distance over which contact on soil renews itself, over the contact length",
         "choice: one contact length brings fresh soil",

@@ -17,6 +17,7 @@ from lunar_mjx.inference.weighing.search import search
 from lunar_mjx.logs import check, read_campaign
 from lunar_mjx.logs.findings import is_bad
 from lunar_mjx.model import make_model
+from tests.diagnosis.drives import drive_campaign as drive_campaign_module
 from tests.diagnosis.drives.drive_campaign import drive_campaign
 
 pytestmark = pytest.mark.slow
@@ -157,3 +158,21 @@ def test_a_usual_error_of_a_clock_is_what_a_late_stamp_does(tmp_path):
     assert np.abs(wanted).max() > 0.01
     # a shift by a millisecond is the derivative but for its square
     np.testing.assert_allclose(change, wanted, atol=0.03 * float(np.abs(wanted).max()))
+
+
+def test_a_jump_of_the_command_is_no_slope_of_a_current(tmp_path, monkeypatch):
+    jump = 1.5
+    monkeypatch.setattr(drive_campaign_module, "PROFILES", (lambda t: 0.0 if t < jump else 2.0,))
+    logs = read_campaign([drive_campaign(tmp_path)])
+    problem = DriveProblem(logs, make_model("luvmi_x", terrain="flat", timestep=0.0025), {}, baseline=BASELINE)
+    predicted, interval = problem.predict(problem.origin()[None])[0], 0.1
+    seen = 0
+    for s in problem.observations.series:
+        if "drive_current" in s.channel:
+            current, rate = predicted[s.start : s.stop], problem.rate[s.start : s.stop]
+            step = int(np.argmax(np.abs(np.diff(current))))
+            assert np.abs(np.diff(current)[step]) > 0.5, "the current jumps"
+            # of the last reading before it; the peak behind it falls on its other side as fast as it rose
+            assert np.abs(rate[step]) * interval < 0.01 * np.abs(np.diff(current)[step])
+            seen += 1
+    assert seen == 4

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.baseline import FROM_NOTHING
-from lunar_mjx.diagnosis.drives.differences import STEP
+from lunar_mjx.diagnosis.drives.differences import STEP, flatter
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel
 from lunar_mjx.diagnosis.drives.refitting.prior import Prior
@@ -47,7 +47,7 @@ class Derivatives:
         steep = self._steep(slopes, free)
         if len(steep):
             other = self._drives.jacobian(u, free[steep], side=-1, steps=self._steps)[1]
-            slopes[:, steep] = _flatter(slopes[:, steep], other)
+            slopes[:, steep] = flatter(slopes[:, steep], other)
         return value, slopes
 
     def _steep(self, slopes: np.ndarray, which: np.ndarray) -> np.ndarray:
@@ -63,8 +63,3 @@ class Derivatives:
         change = values[1:] - values[:1]
         change[~np.isfinite(change).all(axis=1)] = 0.0
         return change.T
-
-
-def _flatter(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Of slopes to two sides the flatter ones, reading by reading."""
-    return np.where(np.isfinite(other) & (np.abs(other) < np.abs(one)), other, one)

@@ -21,7 +21,7 @@ from lunar_mjx.inference.coordinates import NUISANCE
 from lunar_mjx.inference.deadline import Deadline
 from lunar_mjx.inference.fitting import Progress
 from lunar_mjx.inference.observations import Observations
-from lunar_mjx.logs.schema import parse_name
+from lunar_mjx.logs.schema import parse_name, sensor_of
 from lunar_mjx.model import Model
 from lunar_mjx.model.sun import make_sun
 
@@ -243,9 +243,14 @@ def _sample(
 
 
 def at_once(channel: str) -> bool:
-    """Whether a channel jumps at the instant at which a command does."""
+    """Whether a motor's channel jumps at the instant at which a command does."""
     parts = parse_name(channel)
     return parts is not None and parts.quantity in _AT_ONCE
+
+
+def jumps(channel: str) -> bool:
+    """Whether a channel jumps where a command does: a motor's, or an acceleration, which follows from its torque."""
+    return at_once(channel) or sensor_of(channel) == "accelerometer"
 
 
 def _run_of(places: np.ndarray) -> np.ndarray | slice:
