@@ -55,7 +55,7 @@ class RoverCamera:
       backends: of OpenGL; EGL or else OSMesa if None.
 
     Raises:
-      UserError: no OpenGL works here.
+      UserError: no OpenGL works here; or optics with a lens, here or for a free camera, which OpenGL does not draw.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class RoverCamera:
         backends: Sequence[str] | None = None,
         untrodden: bool = False,
     ) -> None:
-        self.camera, self.sun = camera or Pinhole(), sun or Sun()
+        self.camera, self.sun = _plain(camera or Pinhole()), sun or Sun()
         self.mount = mount or front_mount(rover)
         around = np.zeros((1, 2)) if places is None else np.asarray(places, float)
         self.model, self._painter = build_scene(
@@ -134,9 +134,10 @@ class RoverCamera:
 
     def picture(self, pose: Pose, camera: Pinhole | None = None, post: Post | None = None) -> np.ndarray:
         """The colours alone, (height, width, 3) uint8, with a mark if there is one: half the work of `take`."""
+        optics = _plain(camera or self.camera)
         at = self.data.xpos[self._chassis]
         # The shadows' light follows the rover: its shadow map covers some metres only.
-        self._offscreen.look(self.data, pose, camera or self.camera, shadow_light(at, self.sun), post)
+        self._offscreen.look(self.data, pose, optics, shadow_light(at, self.sun), post)
         return self._offscreen.colours()
 
     def close(self) -> None:
@@ -148,6 +149,19 @@ class RoverCamera:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _plain(camera: Pinhole) -> Pinhole:
+    """The optics, if OpenGL can draw them."""
+    if camera.lens is not None:
+        raise bad_input(
+            "camera",
+            "lens",
+            camera.lens,
+            "is not drawn by OpenGL",
+            "leave it out here, or take the picture by the cameras in JAX (cameras.pictures)",
+        )
+    return camera
 
 
 def _label(name: str) -> int:

@@ -1,4 +1,4 @@
-"""The pinhole camera: where it stands, its view and projection matrices, and the rays through its pixels.
+"""The pinhole camera, with a lens or without: its pose, its matrices, and the rays through its pixels.
 
 Conventions are OpenGL's, as in the seed paper's engine: the camera looks along its -z axis, x points right and y up in
 the picture; row 0 is the top. Depth is the distance along the optical axis, m.
@@ -7,11 +7,13 @@ the picture; row 0 is the top. Depth is the distance along the optical axis, m.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
 from jaxtyping import Float
 
+from lunar_mjx.cameras.lens import NAMES, Lens
 from lunar_mjx.errors import bad_input
 
 
@@ -34,8 +36,13 @@ class Pinhole:
     """What a camera's optics and sensor are.
 
     Attributes:
-      width, height: pixels. fovy_deg: vertical angle of view.
+      width, height: pixels. fovy_deg: vertical angle of view, of the pinhole: a lens moves what lies at the edges.
       near, far: clipping planes, m.
+      lens: how the picture is distorted; not at all if None. Cameras in JAX and `project` know it; OpenGL and
+        `projection_matrix` do not.
+
+    Raises:
+      UserError: a value out of range, or a lens that shows two things at one place of the picture.
     """
 
     width: int = 320
@@ -43,6 +50,7 @@ class Pinhole:
     fovy_deg: float = 60.0
     near: float = CLIPPING.near
     far: float = CLIPPING.far
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -54,6 +62,8 @@ class Pinhole:
             raise bad_input(
                 "camera", "near", self.near, f"is not between 0 and far = {self.far:g} m", "give about 0.02"
             )
+        if self.lens is not None:
+            _check_lens(self)
 
     @property
     def focal(self) -> float:
@@ -62,6 +72,8 @@ class Pinhole:
 
     def rays(self) -> Float[np.ndarray, "height width 3"]:
         """Directions through the pixels' centres in the camera's axes, of length 1 along the optical axis."""
+        if self.lens is not None:
+            return _bent(self)
         u = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal
         v = (0.5 * self.height - np.arange(self.height) - 0.5) / self.focal
         x, y = np.meshgrid(u, v)
@@ -79,6 +91,32 @@ class Pinhole:
                 [0, 0, -1, 0],
             ]
         )
+
+
+def _check_lens(camera: Pinhole) -> None:
+    lens = camera.lens
+    if not isinstance(lens, Lens):
+        raise bad_input("camera", "lens", lens, "is no Lens", "give Lens(k1, k2, p1, p2, k3), or leave it out")
+    if not lens.one_to_one(0.5 * camera.width / camera.focal, 0.5 * camera.height / camera.focal):
+        raise bad_input(
+            "camera",
+            "lens",
+            ", ".join(f"{name} = {getattr(lens, name):g}" for name in NAMES if getattr(lens, name)),
+            f"folds the picture over itself ({camera.width} x {camera.height} pixels, fovy_deg = {camera.fovy_deg:g})",
+            "take the coefficients and the angle of view of one calibration, or a narrower view",
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def _bent(camera: Pinhole) -> np.ndarray:
+    """Rays of a camera with a lens: sought once, since they are the same in every picture."""
+    assert camera.lens is not None
+    straight = dataclasses.replace(camera, lens=None).rays()
+    # Calibrations have y downwards.
+    x, y = camera.lens.undistorted(straight[..., 0], -straight[..., 1])
+    out = np.stack([x, -y, -np.ones_like(x)], axis=-1)
+    out.setflags(write=False)
+    return out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +171,10 @@ def project(pose: Pose, camera: Pinhole, points: Float[np.ndarray, "n 3"]) -> Fl
     """Pixel column and row (0, 0 is the corner of the first pixel) and depth in m of points in the world."""
     seen = (np.asarray(points, float) - pose.position) @ pose.rotation
     depth = -seen[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = 0.5 * camera.width + camera.focal * seen[:, 0] / depth
-        v = 0.5 * camera.height - camera.focal * seen[:, 1] / depth
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        right, down = seen[:, 0] / depth, -seen[:, 1] / depth
+        if camera.lens is not None:
+            right, down = camera.lens.distorted(right, down)
+        u = 0.5 * camera.width + camera.focal * right
+        v = 0.5 * camera.height + camera.focal * down
     return np.stack([u, v, depth], axis=-1)

@@ -52,6 +52,30 @@ def test_a_camera_that_looks_down_by_45_deg_sees_the_ground_at_the_root_of_two_t
     assert np.ptp(depth, axis=1).max() < 0.01 and (np.diff(depth[:, 0]) < 0.0).all()
 
 
+def test_a_lens_bends_the_pictures() -> None:
+    """Depth of level ground along the rays of the lens; a cushion's corners look less far aside."""
+    blocks, options = ("goal_body", "camera/depth"), {"camera_pitch_deg": 45.0, "camera_fovy_deg": 50.0}
+    depths = []
+    for lens in ((), (0.3, 0.0, 0.0, 0.0, 0.0)):
+        env = make_navigation(
+            "consistent",
+            terrain="flat",
+            decimation=1,
+            places=8,
+            observations=blocks,
+            camera_lens=lens,
+            **SIZE,
+            **options,
+        )
+        state = jax.jit(env.reset)(env.params, split_keys(jax.random.PRNGKey(0), 1))
+        down = -(env.config.camera.rays() @ front_mount(env.model.rover, 45.0).rotation.T)[..., 2]
+        eye = front_mount(env.model.rover).position[2] + float(state.inner.physics.qpos[0, 2])
+        depth = 60.0 * np.asarray(state.obs[0, 4:]).reshape(12, 16)
+        assert depth == pytest.approx(eye / down, rel=0.02)
+        depths.append(depth)
+    assert np.abs(depths[1] / depths[0] - 1.0).max() > 0.05
+
+
 def test_depth_and_labels_need_no_light() -> None:
     model = make_model("luvmi_x", "lunar_plain")
     system = build(model)

@@ -39,6 +39,7 @@ class Picture(_Part):
     Attributes:
       rows, columns, colours: how many. fovy_deg: vertical angle of view. pitch_deg: how far the camera looks down.
       far_m: depth from which on a pixel reads 1 in `camera/depth`, and beyond which the camera sees nothing, m.
+      lens: its distortion, `D` of a ROS CameraInfo (plumb_bob): k1, k2, p1, p2, k3; empty if there is none.
     """
 
     rows: Annotated[int, Field(ge=1)]
@@ -47,6 +48,7 @@ class Picture(_Part):
     fovy_deg: float
     pitch_deg: float
     far_m: float
+    lens: list[float] = []
 
 
 class Block(_Part):
@@ -230,6 +232,7 @@ def _picture(env: NavigationEnv, size: int) -> Picture:
         fovy_deg=c.camera_fovy_deg,
         pitch_deg=c.camera_pitch_deg,
         far_m=c.camera_far,
+        lens=list(c.camera_lens),
     )
 
 

@@ -85,6 +85,7 @@ class _Plan(NamedTuple):
     focal: float
     near: float
     shaded: bool
+    bent: bool
 
 
 def trace(
@@ -108,37 +109,51 @@ def trace(
     grid, table = ground.tables(terrain)
     dtype = position.dtype
     counts = (0,) * 4 if bodies is None else bodies.counts
-    plan = _Plan(grid, counts, camera.width, camera.height, float(camera.focal), float(camera.near), to_sun is not None)
+    size = camera.width, camera.height
+    bent = camera.lens is not None
+    plan = _Plan(grid, counts, *size, float(camera.focal), float(camera.near), to_sun is not None, bent)
     sun = jnp.zeros(3, dtype) if to_sun is None else jnp.asarray(to_sun, dtype)
     # One short array: a kernel takes arrays only, and each has a cost of its own.
     view = jnp.concatenate([position, turn.reshape(-1), sun, jnp.asarray(far, dtype)[None]])
     shapes = jnp.zeros(solids.WIDTH, dtype) if bodies is None else bodies.table
+    given = [table, view, shapes]
+    if bent:
+        # Right and up over the depth, pixel after pixel: what a lens bends is no formula of column and row.
+        given.append(jnp.asarray(np.moveaxis(camera.rays()[..., :2], -1, 0).reshape(-1), dtype))
     if kernel == "arrays" or (kernel == "auto" and jax.default_backend() != "gpu"):
-        found = _by_arrays(plan, table, view, shapes)
+        found = _by_arrays(plan, *given)
     elif kernel == "interpreted":
-        found = _by_kernel(plan, table, view, shapes, interpret=True)
+        found = _by_kernel(plan, *given, interpret=True)
     else:
         # Chosen when the program is lowered: the same traced function may run on a CPU later.
         found = jax.lax.platform_dependent(
-            table, view, shapes, cuda=functools.partial(_by_kernel, plan), default=functools.partial(_by_arrays, plan)
+            *given, cuda=functools.partial(_by_kernel, plan), default=functools.partial(_by_arrays, plan)
         )
     depth, label, which, *face, lit = (f.reshape(camera.height, camera.width) for f in found)
     return Traced(depth, label, which, jnp.stack(face, axis=-1), lit)
 
 
-def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, column: Any, row: Any) -> tuple:
+def _pixels(
+    plan: _Plan, table: Tables, view: Any, shapes: Any, optics: Any, load: Load, column: Any, row: Any
+) -> tuple:
     """What the rays through pixels meet: depth, label, shape, the normal's components, light; entries like `column`.
 
     Args:
       plan, table, shapes: the scene. view: position, rotation row by row, direction of the Sun, largest depth.
+      optics: rays through pixels, all to the right and then all upwards; None without a lens.
       load: reads tables. column, row: of pixels; those beyond the picture look ahead, too, and are not kept.
     """
     position, sun = (Vec3(*(view[k] for k in range(n, n + 3))) for n in (0, 12))
     turn, far = [view[k] for k in range(3, 12)], view[15]
     dtype = far.dtype
     # Through the middle of pixels; rows count downward, the picture's y upward.
-    px = (column.astype(dtype) + (0.5 - 0.5 * plan.width)) * (1.0 / plan.focal)
-    py = ((0.5 * plan.height - 0.5) - row.astype(dtype)) * (1.0 / plan.focal)
+    if plan.bent:
+        count = plan.width * plan.height
+        pixel = jnp.minimum(row * plan.width + column, count - 1)
+        px, py = load(optics, pixel), load(optics, pixel + count)
+    else:
+        px = (column.astype(dtype) + (0.5 - 0.5 * plan.width)) * (1.0 / plan.focal)
+        py = ((0.5 * plan.height - 0.5) - row.astype(dtype)) * (1.0 / plan.focal)
     direction = Vec3(*(turn[3 * i] * px + turn[3 * i + 1] * py - turn[3 * i + 2] for i in range(3)))
     zero = jnp.zeros_like(px)
     eye = Vec3(*(p + zero for p in position))
@@ -178,7 +193,7 @@ def _pixels(plan: _Plan, table: Tables, view: Any, shapes: Any, load: Load, colu
     return depth, label, which, *face, lit
 
 
-def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any) -> tuple:
+def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any, optics: Any = None) -> tuple:
     """`_pixels` on arrays, some rows of the picture after the other."""
     # A loop over arrays ends with its slowest ray; few rays wait for it here.
     rows = max(1, min(plan.height, TRACE.rays_at_once // plan.width))
@@ -186,13 +201,15 @@ def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any) -> tuple:
 
     def some(first: Any) -> tuple:
         row, column = jnp.meshgrid(first + jnp.arange(rows), jnp.arange(plan.width), indexing="ij")
-        return _pixels(plan, table, view, shapes, ground.take, column.reshape(-1), row.reshape(-1))
+        return _pixels(plan, table, view, shapes, optics, ground.take, column.reshape(-1), row.reshape(-1))
 
     found = jax.lax.map(some, rows * jnp.arange(parts))
     return tuple(f.reshape(-1)[: plan.height * plan.width] for f in found)
 
 
-def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bool = False) -> tuple:
+def _by_kernel(
+    plan: _Plan, table: Tables, view: Any, shapes: Any, optics: Any = None, interpret: bool = False
+) -> tuple:
     """`_pixels` as one kernel, each program with one tile."""
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
@@ -204,12 +221,12 @@ def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bo
         return triton.load(ref.at[index]) if np.ndim(index) else ref[index]
 
     def program(*refs: Any) -> None:
-        given, view_ref, shapes_ref, out = Tables(*refs[:5]), refs[5], refs[6], refs[7:]
+        given, view_ref, shapes_ref, out = Tables(*refs[:5]), refs[5], refs[6], refs[7 + plan.bent :]
         number, lane = pallas.program_id(0), jnp.arange(wide * high, dtype=jnp.int32)
         # Tiles and not rows: neighbouring rays ask the same squares, which then are in the cache.
         column = (number % across) * wide + lane % wide
         row = (number // across) * high + lane // wide
-        found = _pixels(plan, given, view_ref, shapes_ref, load, column, row)
+        found = _pixels(plan, given, view_ref, shapes_ref, refs[7] if plan.bent else None, load, column, row)
         kept = (column < plan.width) & (row < plan.height)
         # Pixels beyond the edge aim at the first one, and the mask keeps them from writing.
         place = jnp.where(kept, row * plan.width + column, 0)
@@ -226,4 +243,4 @@ def _by_kernel(plan: _Plan, table: Tables, view: Any, shapes: Any, interpret: bo
         interpret=interpret,
         name="trace",
     )
-    return tuple(call(*table, view, shapes))
+    return tuple(call(*table, view, shapes, *(() if optics is None else (optics,))))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.cameras import Pinhole, Sun
+from lunar_mjx.cameras import Pinhole, Sun, lens_of
 from lunar_mjx.cameras.mount import FRONT_MOUNT
 from lunar_mjx.envs.ladder.rungs import COLLISIONS, RUNGS, get_rung
 from lunar_mjx.envs.navigation.actions import ACTION_MODES
@@ -56,7 +56,7 @@ class NavigationConfig:
         the scan's lowest value; 0: it sees all.
       camera_width, camera_height: pixels of the blocks camera/rgb, camera/depth and camera/labels.
       camera_fovy_deg: vertical angle of view. camera_pitch_deg: how far the camera looks down. camera_far: how far it
-        looks, m.
+        looks, m. camera_lens: its distortion, `D` of a ROS CameraInfo: k1, k2, p1, p2, k3; none if empty.
       sun_azimuth_deg, sun_elevation_deg: where the Sun stands, clockwise from north (y).
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
         dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`, and so a rover that is
@@ -106,6 +106,7 @@ class NavigationConfig:
     camera_fovy_deg: float = 60.0
     camera_pitch_deg: float = FRONT_MOUNT.pitch_deg
     camera_far: float = 60.0
+    camera_lens: tuple[float, ...] = ()
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
     delay: float = 0.0
@@ -128,7 +129,8 @@ class NavigationConfig:
     @property
     def camera(self) -> Pinhole:
         """Optics of the front camera."""
-        return Pinhole(self.camera_width, self.camera_height, self.camera_fovy_deg)
+        lens = lens_of(self.camera_lens, "navigation", "camera_lens")
+        return Pinhole(self.camera_width, self.camera_height, self.camera_fovy_deg, lens=lens)
 
     @property
     def sun(self) -> Sun:
