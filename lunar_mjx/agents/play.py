@@ -13,7 +13,8 @@ from PIL import Image
 from scipy import ndimage
 
 from lunar_mjx.agents.policy import load_policy, shipped_policies, shipped_policy, taught_in
-from lunar_mjx.cameras.chase import Chase, wheel_tracks
+from lunar_mjx.cameras.chase import Chase, tracks_of
+from lunar_mjx.cameras.dust import Dust, wheel_motion
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
 from lunar_mjx.envs.core import PER_STEP
@@ -217,8 +218,9 @@ class Episode:
 
         still = drawn(len(self.qpos) - 1)
         if view != "top":
+            motion = wheel_motion(rover, self.qpos)
             try:
-                camera = Chase(rover, terrain, places, tracks=wheel_tracks(rover, self.qpos))
+                camera = Chase(rover, terrain, places, tracks=tracks_of(rover, motion.centre))
             except UserError:
                 if view == "camera":
                     raise
@@ -226,7 +228,13 @@ class Episode:
                 ground = float(height(terrain.field, *self.goal[:2]))
                 # Smoothed over a second, or the camera shakes with the rover.
                 yaw = ndimage.gaussian_filter1d(np.unwrap(self.yaw), 1.0 / self.env.control_interval, mode="nearest")
-                frames = [camera.frame(self.qpos[i], float(yaw[i]), self.goal, ground, i) for i in steps]
+                interval, model = self.env.control_interval, self.env.model
+                hard = "hard_surface" in model.effect_names
+                dust = Dust(rover, terrain, interval * np.arange(len(self.qpos)), motion, model.gravity, hard)
+                frames = [
+                    camera.frame(self.qpos[i], float(yaw[i]), self.goal, ground, i, dust=dust.at(interval * i))
+                    for i in steps
+                ]
                 camera.close()
                 return frames, still
         return [drawn(i) for i in steps], still

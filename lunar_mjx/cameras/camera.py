@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lunar_mjx.cameras.dust import Grains, sunlit, veiled
 from lunar_mjx.cameras.gl import Offscreen, Post
 from lunar_mjx.cameras.mount import carried, front_mount
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
@@ -132,13 +133,25 @@ class RoverCamera:
         rgba = np.concatenate([colours, np.full((*colours.shape[:2], 1), 255, np.uint8)], axis=-1)
         return Images(rgba, depth, self._labels[geoms], pose.view_matrix(), optics.projection_matrix())
 
-    def picture(self, pose: Pose, camera: Pinhole | None = None, post: Post | None = None) -> np.ndarray:
-        """The colours alone, (height, width, 3) uint8, with a mark if there is one: half the work of `take`."""
+    def picture(
+        self, pose: Pose, camera: Pinhole | None = None, post: Post | None = None, dust: Grains | None = None
+    ) -> np.ndarray:
+        """The colours alone, (height, width, 3) uint8: half the work of `take`.
+
+        Args:
+          pose, camera: where from, and by which optics. post: a mark, if there is one. dust: grains in flight.
+        """
         optics = _plain(camera or self.camera)
         at = self.data.xpos[self._chassis]
         # The shadows' light follows the rover: its shadow map covers some metres only.
         self._offscreen.look(self.data, pose, optics, shadow_light(at, self.sun), post)
-        return self._offscreen.colours()
+        if dust is None or not len(dust.position):
+            return self._offscreen.colours()
+        colours, depth = self._offscreen.colours_and_depth()
+        towards = self.sun.direction
+        return veiled(
+            colours, depth, pose, optics, dust, sunlit(self.model, self.data, dust.position, towards), towards
+        )
 
     def close(self) -> None:
         """Frees the OpenGL context."""

@@ -7,10 +7,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from lunar_mjx.cameras.camera import RoverCamera
+from lunar_mjx.cameras.dust import Grains, wheel_motion
 from lunar_mjx.cameras.gl import Post
 from lunar_mjx.cameras.ground_map import MAP_COLOURS
 from lunar_mjx.cameras.pinhole import Pinhole, look_at
@@ -35,15 +35,7 @@ GOAL_POST = GoalPost()
 
 def wheel_places(rover: Rover, qpos: np.ndarray) -> np.ndarray:
     """Centres of a rover's wheels, (time, wheel, 3) m, for coordinates (time, nq) of its MJCF."""
-    model = rover.compile()
-    data = mujoco.MjData(model)
-    bodies = [model.body(w.body).id for w in rover.wheels]
-    out = np.empty((len(qpos), len(bodies), 3))
-    for row, row_qpos in enumerate(qpos):
-        data.qpos[:] = row_qpos
-        mujoco.mj_kinematics(model, data)
-        out[row] = data.xpos[bodies]
-    return out
+    return wheel_motion(rover, qpos).centre
 
 
 def wheel_tracks(rover: Rover, qpos: np.ndarray) -> list[Track]:
@@ -87,7 +79,14 @@ class Chase:
         self._tracks = bool(tracks)
 
     def frame(
-        self, qpos: Any, yaw: float, goal: Any, ground: float, row: int | None = None, grown: Sequence[Track] = ()
+        self,
+        qpos: Any,
+        yaw: float,
+        goal: Any,
+        ground: float,
+        row: int | None = None,
+        grown: Sequence[Track] = (),
+        dust: Grains | None = None,
     ) -> np.ndarray:
         """One picture, (height, width, 3) uint8.
 
@@ -96,6 +95,7 @@ class Chase:
           goal: (2,) m. ground: height there, m.
           row: wheel tracks are shown up to this row of their places.
           grown: tracks so far, where they are not known beforehand; those of the frame before, and on.
+          dust: grains in flight, see `dust.Dust`.
         """
         self._camera.place(qpos)
         if row is not None and self._tracks:
@@ -110,7 +110,7 @@ class Chase:
         # From far away it is a pixel wide, or it would come and go.
         radius = max(GOAL_POST.radius, 0.5 * depth / self._optics.focal)
         post = Post(foot, foot + np.array([0.0, 0.0, GOAL_POST.height]), radius, MAP_COLOURS.goal)
-        return self._camera.picture(pose, self._optics, post)
+        return self._camera.picture(pose, self._optics, post, dust)
 
     def close(self) -> None:
         """Frees the OpenGL context."""

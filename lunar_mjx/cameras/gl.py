@@ -154,6 +154,13 @@ class Offscreen:
         # OpenGL's rows begin at the bottom.
         return out[::-1].copy()
 
+    def colours_and_depth(self) -> tuple[np.ndarray, np.ndarray]:
+        """The picture, (height, width, 3) uint8, and its depth, m (infinite where nothing is), of one pass."""
+        shape = (self._size[1], self._size[0])
+        colour, buffer = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
+        self._render(colour, buffer)
+        return colour[::-1].copy(), self._metres(buffer)[::-1]
+
     def depth_and_geoms(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth, m (infinite where nothing is), and the geom that each pixel shows (-1 for none), (height, width)."""
         # The scene is shared with the pass for colours, which must not see the flags of this one.
@@ -170,12 +177,15 @@ class Offscreen:
         for geom in self._scene.geoms[: self._scene.ngeom]:
             if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 geoms[geom.segid + 1] = geom.objid
+        return self._metres(buffer)[::-1].astype(np.float32), geoms[number[::-1]]
+
+    def _metres(self, buffer: np.ndarray) -> np.ndarray:
         near, far = self._camera.near, self._camera.far
         with np.errstate(divide="ignore"):
             # the buffer runs from 1 at the near plane to 0 at the far one, in inverse distance
             depth = near * far / (near + buffer.astype(float) * (far - near))
         depth[buffer <= 0.0] = np.inf
-        return depth[::-1].astype(np.float32), geoms[number[::-1]]
+        return depth
 
     def upload(self, texture: int) -> None:
         """Sends a texture of the model anew."""

@@ -65,6 +65,13 @@ class Regolith:
         # r = (w / 4 pi) mu0 / (mu0 + mu) [p (1 + B) + H H - 1], and I/F = pi r
         return 0.25 * self.albedo * mu0 / (mu0 + mu) * (single + many)
 
+    def cloud(self, cos_phase: Any) -> Any:
+        """I/F of a thick cloud of the soil's grains that scatter light once, of any shape: w p(g) / 4.
+
+        Grains that fly do not shade each other, so that they have no opposition surge.
+        """
+        return 0.25 * self.albedo * self._phase(cos_phase)
+
     def _phase(self, cos_phase: Any) -> Any:
         """Double Henyey-Greenstein phase function p(g)."""
         b2, two_b = self.lobe**2, 2.0 * self.lobe

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.cameras.chase import Chase, tracks_of, wheel_places
+from lunar_mjx.cameras.chase import Chase, tracks_of
+from lunar_mjx.cameras.dust import Dust, Grains, WheelMotion, wheel_motion
 from lunar_mjx.cameras.ground_map import GroundMap
-from lunar_mjx.cameras.texture import Track
 from lunar_mjx.envs.core import State
 from lunar_mjx.envs.navigation.env import NavigationEnv
 from lunar_mjx.errors import UserError, bad_input
@@ -49,7 +49,7 @@ class Picture:
         self._qpos = np.zeros(0)
         self._path: list[np.ndarray] = []
         self._poses: list[np.ndarray] = []  # that no picture has shown yet
-        self._wheels: list[np.ndarray] = []  # their places until then
+        self._wheels: WheelMotion | None = None  # their motion until then
 
     @staticmethod
     def fits(env: Any) -> bool:
@@ -63,7 +63,7 @@ class Picture:
         self._goal = np.asarray(state.inner.goal[0])
         # The ground where the rover starts: cameras and markers count heights from there.
         self._ground = float(self._qpos[2]) - self.env.model.rover.standing_height
-        self._path, self._poses, self._wheels = [self._qpos[:2]], [self._qpos], []
+        self._path, self._poses, self._wheels = [self._qpos[:2]], [self._qpos], None
         self._top, self._camera, self._tried = None, None, False
 
     def add(self, state: State, done: bool) -> None:
@@ -85,7 +85,9 @@ class Picture:
         yaw = float(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
         camera = self._open()
         if camera is not None:
-            return camera.frame(self._qpos, yaw, self._goal, self._ground, grown=self._tracks())
+            wheels = self._moved()
+            tracks = tracks_of(self.env.model.rover, wheels.centre)
+            return camera.frame(self._qpos, yaw, self._goal, self._ground, grown=tracks, dust=self._thrown(wheels))
         if self._top is None:
             places = self._places()
             low, high = places.min(axis=0) - MAP_MARGINS.around, places.max(axis=0) + MAP_MARGINS.around
@@ -93,13 +95,22 @@ class Picture:
         size = 5.0 * self.env.model.rover.standing_height
         return self._top.frame(self._qpos, yaw, self._goal, self.env.config.goal_radius, self._path, size)
 
-    def _tracks(self) -> list[Track]:
-        """Where the wheels rolled so far; poses are turned into places of wheels once."""
-        rover = self.env.model.rover
+    def _moved(self) -> WheelMotion:
+        """How the wheels moved so far; poses are turned into places of wheels once."""
         if self._poses:
-            self._wheels.extend(wheel_places(rover, np.stack(self._poses)))
+            new = wheel_motion(self.env.model.rover, np.stack(self._poses))
+            kept = self._wheels
+            self._wheels = new if kept is None else WheelMotion(*map(np.concatenate, zip(kept, new, strict=True)))
             self._poses = []
-        return tracks_of(rover, np.stack(self._wheels))
+        assert self._wheels is not None
+        return self._wheels
+
+    def _thrown(self, wheels: WheelMotion) -> Grains:
+        """What the wheels throw up now."""
+        model, time = self.env.model, self.env.control_interval * np.arange(len(wheels.angle))
+        hard = "hard_surface" in model.effect_names
+        terrain = self.env.params.system.terrain
+        return Dust(model.rover, terrain, time, wheels, model.gravity, hard).at(float(time[-1]))
 
     def _places(self) -> np.ndarray:
         ends = np.stack([self._path[0], self._goal])

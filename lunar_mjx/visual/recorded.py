@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.cameras.chase import wheel_places, wheel_tracks
+from lunar_mjx.cameras.chase import tracks_of
+from lunar_mjx.cameras.dust import Dust, WheelMotion, wheel_motion
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError, bad_input, one_line
@@ -125,13 +126,24 @@ class RecordedDrive:
                 _close(model, data, out[row], passive, passive_qpos)
         return out
 
+    @functools.cached_property
+    def wheel_motion(self) -> WheelMotion:
+        """Places of the wheels and how far they have turned."""
+        return wheel_motion(self.model.rover, self.qpos)
+
     def wheel_places(self) -> np.ndarray:
         """Centres of the wheels, (time, wheel, 3) m."""
-        return wheel_places(self.model.rover, self.qpos)
+        return self.wheel_motion.centre
 
     def tracks(self) -> list[Track]:
         """Where the wheels rolled, a row of places for each row of the table."""
-        return wheel_tracks(self.model.rover, self.qpos)
+        return tracks_of(self.model.rover, self.wheel_places())
+
+    def dust(self) -> Dust:
+        """What the wheels throw up."""
+        model = self.model
+        hard = "hard_surface" in model.effect_names
+        return Dust(model.rover, self.terrain, self.time, self.wheel_motion, model.gravity, hard)
 
 
 def _close(model: Any, data: Any, qpos: np.ndarray, passive: np.ndarray, at: np.ndarray) -> None:

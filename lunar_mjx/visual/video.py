@@ -112,6 +112,7 @@ class _Follow:
         self._optics = Pinhole(camera.camera.width, camera.camera.height, 42.0)
         reach = float(np.abs(drive.model.rover.chassis_points).max())
         self._away, self._up = 5.5 * reach, 1.9 * reach
+        self._time, self._dust = drive.time, drive.dust()
         # Unwrapped, since a mean across 180 degrees would turn the camera around.
         yaw = np.unwrap(np.radians(drive.columns(["yaw_deg"])[:, 0]))
         interval = float(np.median(np.diff(drive.time)))
@@ -124,9 +125,10 @@ class _Follow:
         camera = self._camera
         camera.place(self._qpos[row])
         camera.roll(row + 1)
+        grains = self._dust.at(float(self._time[row]))
         if self._front:
-            return camera.picture(camera.front_pose)
-        return camera.picture(self._pose(row), self._optics)
+            return camera.picture(camera.front_pose, dust=grains)
+        return camera.picture(self._pose(row), self._optics, dust=grains)
 
     def _pose(self, row: int) -> Pose:
         at, angle = self._at[row], self._yaw[row] + self._side

@@ -16,7 +16,8 @@ def test_wheel_tracks_grow_while_the_rover_drives(opengl: None) -> None:
     """A picture of a rover that came along a way differs from one of a rover set down: two dark lines lie behind it."""
     rover = load_rover("viper")
     env: Any = SimpleNamespace(
-        model=SimpleNamespace(rover=rover),
+        model=SimpleNamespace(rover=rover, gravity=1.62, effect_names=()),
+        control_interval=0.1,
         params=SimpleNamespace(system=SimpleNamespace(terrain=flat(60.0))),
         config=SimpleNamespace(goal_radius=1.0),
     )
@@ -34,7 +35,7 @@ def test_wheel_tracks_grow_while_the_rover_drives(opengl: None) -> None:
         if x > 1.4:
             driven.frame()
     placed.add(state(3.0), done=False)
-    placed._wheels, placed._poses = [], [placed._qpos]
+    placed._wheels, placed._poses = None, [placed._qpos]
     trodden, plain = driven.frame().astype(float), placed.frame().astype(float)
     for drawn in (driven, placed):
         drawn.close()
