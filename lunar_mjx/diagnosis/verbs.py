@@ -20,6 +20,7 @@ from lunar_mjx.diagnosis.build_problem import (
     require_splits,
 )
 from lunar_mjx.diagnosis.contact_laws import better_law
+from lunar_mjx.diagnosis.drives.baseline import with_nominal_controller
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.windows import verbs as windows
@@ -104,6 +105,8 @@ def _compare(run: Run, progress: Progress) -> Run:
         return windows.compare(run, campaign, progress)
     # Before the folder is made: a mistake leaves nothing behind.
     (TableSettings if isinstance(campaign[0], SteadyLog) else DriveSettings).of(run.settings)
+    if not isinstance(campaign[0], SteadyLog):
+        run = dataclasses.replace(run, model=with_nominal_controller(run.model))
     run.write()
     # Without candidates: what may be missing is the business of `why`, and would cost compiling here.
     problem = _problem(run, campaign, (), progress)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lunar_mjx.backends import POINTS, Hook, NativeBackend
+from lunar_mjx.diagnosis.drives.baseline import with_nominal_controller
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 
@@ -86,6 +87,16 @@ def test_resistance_of_the_winding_point_heats(model):
     double = _driven(model, [Hook("double", {"winding": _scaled("resistance", 2.0)})], steps=1).observe()
     np.testing.assert_allclose(double["winding_heat"], 2.0 * plain["winding_heat"], rtol=1e-4)
     assert plain["winding_heat"].max() > 0.1
+
+
+def test_a_controller_asks_by_the_number_that_it_was_told(model):
+    known = with_nominal_controller(model)
+    strong = {"torque_constant": tuple(1.05 * k for k in model.parameters["motor"]["torque_constant"])}
+    plain, told, knowing = (
+        _driven(m, steps=1).observe() for m in (model, known.set("motor", **strong), model.set("motor", **strong))
+    )
+    np.testing.assert_allclose(told["current"], plain["current"], rtol=1e-9)
+    np.testing.assert_allclose(knowing["current"], plain["current"] / 1.05, rtol=1e-9)
 
 
 def test_the_cut_off_has_the_last_word(model):

@@ -93,6 +93,15 @@ def test_torque_without_a_gear_needs_the_current_of_flaw_8() -> None:
     assert drive(TORQUE, 15.0, **values)["current"] == pytest.approx(882.35, abs=0.01)
 
 
+def test_a_controller_reckons_with_its_own_number_and_the_motor_does_not() -> None:
+    """A motor that is 5 % stronger than its data sheet gets the data sheet's current, and gives 5 % more torque."""
+    values = {"motor": {"torque_constant": 1.05 * 0.0716}}
+    told = {**values, "joint_control": {"assumed_torque_per_ampere": PER_AMPERE}}
+    assert drive(TORQUE, 15.0, **told)["current"] == pytest.approx(15.0 / PER_AMPERE, rel=1e-12)
+    assert drive(TORQUE, 15.0, **told)["torque"] == pytest.approx(1.05 * 15.0, rel=1e-12)
+    assert drive(TORQUE, 15.0, **values)["torque"] == pytest.approx(15.0, rel=1e-12)
+
+
 def test_current_control() -> None:
     """A: passed on, tau = N eta K I (eq. 15)."""
     out = drive(CURRENT, np.array([2.0, -3.0]))

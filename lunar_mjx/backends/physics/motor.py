@@ -23,7 +23,8 @@ def controller(c: Context, p: SimpleNamespace) -> np.ndarray:
     # One formula for both loops: the position loop's speed error is the speed itself.
     torque = numbers.position_gain * error - numbers.velocity_gain * speed
     torque = np.where(numbers.mode < 2, torque, c.target)
-    current = torque / (motor.gear_ratio * motor.gear_efficiency * motor.torque_constant)
+    own = motor.gear_ratio * motor.gear_efficiency * motor.torque_constant
+    current = torque / np.where(p.assumed_torque_per_ampere > 0.0, p.assumed_torque_per_ampere, own)
     current = np.where(numbers.mode == 3, c.target, current)
     return np.minimum(np.maximum(current, -p.current_limit), p.current_limit)
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lunar_mjx.diagnosis.build_problem import candidates_of
 from lunar_mjx.diagnosis.contact_laws import CLOSED_FORM, LAWS, contact_laws, log_shares
+from lunar_mjx.diagnosis.drives.baseline import with_nominal_controller
 from lunar_mjx.diagnosis.drives.form import LEARNT, DriveForm
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -43,13 +44,14 @@ def build_drives(
     """
     settings = DriveSettings.of(run.settings)
     wanted = candidates_of(run, only) if candidates is None else candidates
-    drives = DriveProblem(logs, run.model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
+    model = with_nominal_controller(run.model)
+    drives = DriveProblem(logs, model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
     form = DriveForm(drives, settings, progress)
     kept = kept_start(run, form, frozenset())
     if kept is not None:
         told = run.load(COMPARISON_FILE) or {}
         form.start, form.kept = kept, told if LEARNT.issubset(told) else {}
-    forms, laws = [form], contact_laws(run.model, settings.laws)
+    forms, laws = [form], contact_laws(model, settings.laws)
     own = next(iter(laws))
     if settings.laws and own not in LAWS:
         problem = "has no use beside a model without a closed form"

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, StateVariable, effect
-from lunar_mjx.effects.joint.motor import POSITION, VELOCITY, torque_per_ampere
+from lunar_mjx.effects.joint.motor import POSITION, VELOCITY, asked_per_ampere
 
 EVENTS = 8
 """Changes of the command that a delay remembers."""
@@ -131,7 +131,7 @@ def backlash(ctx, p, x, command):
     the landing rotor is left out.
     """
     k_p, k_d, closed = _loop_gains(ctx.rover)
-    per_ampere = torque_per_ampere(ctx.parameters["motor"])
+    per_ampere = asked_per_ampere(ctx.parameters)  # the speed of a free motor is what its controller asks for
     stiffness = k_d + k_p * ctx.dt
     acts = closed & (stiffness > 0.0)
     # Where no loop is closed the division below is computed all the same and dropped: it must stay finite for its

@@ -38,6 +38,19 @@ def torque_per_ampere(motor) -> jnp.ndarray:
     return motor.gear_ratio * motor.gear_efficiency * motor.torque_constant
 
 
+def asked_per_ampere(parameters) -> jnp.ndarray:
+    """N m at the joint that the controller expects of an ampere.
+
+    Args:
+      parameters: of all effects, by name, those of `motor` and `joint_control` among them.
+    """
+    own = torque_per_ampere(parameters["motor"])
+    if "joint_control" not in parameters:
+        return own
+    assumed = parameters["joint_control"].assumed_torque_per_ampere
+    return jnp.where(assumed > 0.0, assumed, own)
+
+
 @effect(
     "command",
     requires=("motor",),
@@ -45,21 +58,32 @@ def torque_per_ampere(motor) -> jnp.ndarray:
     current_limit=Parameter(
         11.6, None, (0.0, 1e3), "A", "largest current of the amplifier", _MAXON + ", stall current", axis="joint"
     ),
+    assumed_torque_per_ampere=Parameter(
+        0.0,
+        None,
+        (0.0, 1e6),
+        "N m/A",
+        "torque at the joint that the controller expects of an ampere; 0: what the motor gives at 25 degC",
+        "choice: a controller that knows its motor",
+        axis="joint",
+    ),
 )
 def joint_control(ctx, p, x, command):
     """Turns each joint's target into a motor current by the joint's control mode.
 
     Position: PD, tau = k_p (q* - q) - k_d qdot. Velocity: P, tau = k_d (omega* - omega). Torque: tau = target, asked
-    for as the current that gives it at 25 degC (eq. 15). Current: passed on. Source: seed paper III-D.
+    for as the current that gives it at 25 degC (eq. 15). Current: passed on. Source: seed paper III-D. A controller
+    whose numbers are the data sheet's (`assumed_torque_per_ampere`) asks for the current by these, whatever motor was
+    built in.
     """
-    motor, rover = ctx.parameters["motor"], ctx.rover
+    rover = ctx.rover
     target, mode = command.target, rover.mode
     position = rover.position_gain * (target - ctx.joint_angle) - rover.velocity_gain * ctx.joint_speed
     # Without feedforward: the paper's controller has none, and a steady drag then shows as a steady speed error.
     velocity = rover.velocity_gain * (target - ctx.joint_speed)
     torque = jnp.where(mode == POSITION, position, jnp.where(mode == VELOCITY, velocity, target))
     # The controller does not know how warm the winding is: it asks for the current that gives the torque at 25 degC.
-    current = jnp.where(mode == CURRENT, target, torque / torque_per_ampere(motor))
+    current = jnp.where(mode == CURRENT, target, torque / asked_per_ampere(ctx.parameters))
     # The amplifier clips current, whatever asked for it: a torque limit would move with the winding's temperature.
     return dataclasses.replace(command, current=jnp.clip(current, -p.current_limit, p.current_limit))
 
