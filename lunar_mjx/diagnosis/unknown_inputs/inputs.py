@@ -115,6 +115,7 @@ QUANTITY_SIZES: Mapping[str, float] = {
     "joint speed": 2.0,
     "squared joint speed": 4.0,
     "direction": 1.0,
+    "rolling direction": 1.0,
     "wheel speed": 2.0,
     "slip": 0.3,
     "signed slip": 0.3,
@@ -130,7 +131,7 @@ QUANTITY_SIZES: Mapping[str, float] = {
 follow the motion."""
 
 _AT_REST = 0.03
-"""rad/s of a joint below which it has hardly a direction."""
+"""rad/s of a joint or a wheel below which it has hardly a direction."""
 
 
 def _below(speed: float) -> Callable[[Any, Any], Any]:
@@ -146,6 +147,7 @@ _READ: Mapping[str, Callable[[Any, Any], Any]] = {
     "squared joint speed": lambda ctx, value: ctx.joint_speed * jnp.abs(ctx.joint_speed),
     # A sign that has a derivative where the joint stands still.
     "direction": lambda ctx, value: jnp.tanh(ctx.joint_speed / _AT_REST),
+    "rolling direction": lambda ctx, value: jnp.tanh(_wheel_speed(ctx) / _AT_REST),
     "wheel speed": lambda ctx, value: _wheel_speed(ctx),
     "slip": lambda ctx, value: ctx.contact.soil_slip,
     "signed slip": lambda ctx, value: value.slip_x,
@@ -173,9 +175,10 @@ FOLLOWS: Mapping[str, tuple[str, ...]] = {
     "soil: shear strength": ("slip", "wheel speed"),
     "wheel_normal: load": ("constant", "slip", "load"),
     "wheel_normal: resistance": ("constant", "slip", "wheel speed"),
-    "wheel_shear: longitudinal force": ("constant", "signed slip", "wheel speed"),
+    # A wheel has no front: what soil does to one that rolls back is the mirror image.
+    "wheel_shear: longitudinal force": ("rolling direction", "signed slip", "wheel speed"),
     "wheel_shear: lateral force": ("constant", "lateral slip"),
-    "wheel_shear: driving moment": ("constant", "signed slip", "wheel speed"),
+    "wheel_shear: driving moment": ("rolling direction", "signed slip", "wheel speed"),
     # How shear begins as a wheel starts, no law of steady driving tells, and every simulator rounds it off somewhere.
     "wheel_shear: shear at a crawl": ("below 1 cm/s", "below 3 cm/s", "below 10 cm/s"),
     "body_wrench: push": ("constant", "travel speed"),
