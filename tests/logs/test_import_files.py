@@ -102,6 +102,40 @@ joint_lf_drive_speed_rad_s = "speed"
     assert any("note" in note for _, note in found.notes), "a column that nobody reads is named"
 
 
+COMMAS = """t;links;I
+s;m/s;A
+0,00;1,5;2,0
+0,05;1,6;-2,5
+0,10;;3,0
+"""
+
+
+def test_a_row_of_units_is_left_out_and_decimal_commas_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_text(COMMAS, encoding="utf-8")
+    text = """
+[log]
+rover = "husky"
+[tables.drive]
+file = "a.csv"
+time = "t"
+[tables.drive.channels]
+joint_left_drive_speed_rad_s = { column = "links", scale = 2.0 }
+motor_left_drive_current_A = "I"
+"""
+    with pytest.raises(UserError, match=r't, row 0 = \'0,00\' is no number; write decimal = ","'):
+        import_drives(file, tmp_path / "log", write_map(tmp_path, text))
+    with pytest.raises(UserError, match=r'links, row 0 = \'1,5\' .*; write decimal = ","'):
+        import_drives(file, tmp_path / "log", write_map(tmp_path, text.replace('"t"', "{ rate_hz = 20 }")))
+    told = text.replace('time = "t"', 'time = "t"\ndecimal = ","')
+    found = import_drives(file, tmp_path / "log", write_map(tmp_path, told))
+    table = drive(found.folder).tables["drive"]
+    np.testing.assert_allclose(table.time_s, [0.0, 0.05, 0.1])
+    np.testing.assert_allclose(table.channels["joint_left_drive_speed_rad_s"], [3.0, 3.2, np.nan])
+    np.testing.assert_allclose(table.channels["motor_left_drive_current_A"], [2.0, -2.5, 3.0])
+    assert any("under the header holds no number (s, m/s, A) and is left out" in note for _, note in found.notes)
+
+
 TWO = """
 [log]
 rover = "luvmi_x"

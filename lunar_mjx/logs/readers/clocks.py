@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,8 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
     if not text.all():
         row = int(np.argmin(text))
         shown = str(cells.iloc[row])
-        remedy = "write clock = true for times of day and dates" if ":" in shown else "correct the cell"
+        remedy = "write clock = true for times of day and dates" if ":" in shown else remedy_of_text(shown)
+        remedy = remedy or "correct the cell"
         raise bad_input(path, f"{time.column}, row {row}", shown, "is no number", remedy)
     seconds = UNITS[time.unit] * values
     far = np.abs(seconds) > LATEST
@@ -69,6 +71,11 @@ def seconds(frame: pd.DataFrame, time: TimeColumn, path: Path) -> np.ndarray:
             path, f"{time.column}, row {row}", values[row], "is thousands of years", "state the unit in the map's table"
         )
     return seconds
+
+
+def remedy_of_text(cell: str) -> str:
+    """What to state in a map so that a cell becomes a number; "" where nothing would."""
+    return 'write decimal = "," in the table of the map' if re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", cell) else ""
 
 
 def _clock(cells: pd.Series, path: Path) -> np.ndarray:

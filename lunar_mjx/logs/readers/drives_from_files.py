@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.errors import UserError, bad_input
-from lunar_mjx.logs.readers.clocks import seconds
+from lunar_mjx.logs.readers.clocks import remedy_of_text, seconds
 from lunar_mjx.logs.readers.import_map import FOLDER, ImportMap, Source, TableMap, file_pattern
 from lunar_mjx.logs.readers.recorded_drive import (
     LATITUDE,
@@ -22,7 +22,7 @@ from lunar_mjx.logs.readers.recorded_drive import (
     without_empty,
 )
 from lunar_mjx.logs.readers.table import cut_row
-from lunar_mjx.logs.readers.table_files import SUFFIXES, read_table_file
+from lunar_mjx.logs.readers.table_files import SUFFIXES, read_table_file, without_units
 
 GAPS = ("", "nan", "na", "n/a", "null", "none", "-", "inf", "-inf")
 """Texts that mean a gap, in small letters."""
@@ -41,7 +41,7 @@ def drives_of_files(paths: Sequence[Path], mapping: ImportMap) -> Iterator[Recor
         for drive in _read(name, files, mapping):
             # what holds for every file of a kind is said once
             fresh = tuple(n for n in drive.notes if n not in told)
-            told.update(n for n in fresh if "not mapped" in n)
+            told.update(n for n in fresh if "not mapped" in n or "under the header" in n)
             yield dataclasses.replace(drive, notes=fresh)
 
 
@@ -154,6 +154,10 @@ def _rising(frame: pd.DataFrame) -> np.ndarray:
 def _frame(path: Path, table: TableMap, where: str, notes: list[str]) -> pd.DataFrame:
     """Time, channels and what groups or places need, from one file."""
     raw = read_table_file(path, table.layout, table.columns)
+    if table.layout.header:
+        raw, units = without_units(raw, table.layout.decimal)
+        if units:
+            notes.append(f"{table.file}: the row under the header holds no number ({units[:60]}) and is left out")
     if cut := cut_row(path, raw):
         notes.append(f"{table.file}, row {cut[0]}: {cut[1]}")
         raw = raw.iloc[:-1]
@@ -202,7 +206,8 @@ def _numbers(cells: pd.Series, missing: tuple[float, ...], path: Path, column: s
             f"{column}, row {row}",
             str(cells.iloc[row]),
             "is neither a number nor a gap",
-            "correct the cell, or state separator, decimal and skip_rows in the map",
+            remedy_of_text(str(cells.iloc[row]))
+            or "correct the cell, or state separator, decimal and skip_rows in the map",
         )
     values = np.where(np.isfinite(values), values, np.nan)
     return np.where(np.isin(values, missing), np.nan, values) if missing else values

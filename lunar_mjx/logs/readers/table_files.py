@@ -131,21 +131,54 @@ def _refuse_one_name(path: Path, header: pd.DataFrame, wanted: Sequence[str]) ->
 def guess_separator(start: str, decimal: str = ".") -> str:
     """The separator of a text table, as pandas calls it: the one that splits most rows into equally many cells.
 
+    One that splits the first line into as many goes first: a decimal comma splits the numbers, and no names.
+
     Args:
       start: the first rows. decimal: sign in numbers, which is then no separator.
     """
     # Without the first line: a header or title may have another number of cells.
     lines = [line for line in start.splitlines()[1:200] if line.strip()] or start.splitlines()
-    best, most = r"\s+", 1
+    first = next((line for line in start.splitlines() if line.strip()), "")
+    best, most = r"\s+", (False, 1)
     for sign in (",", ";", "\t"):
         if sign == decimal:
             continue
         # By csv, since quoted cells may hold the sign.
         counts = [len(next(csv.reader([line], delimiter=sign))) for line in lines]
         typical = int(np.median(counts))
-        if typical > most and np.mean(np.array(counts) == typical) > SNIFFING.most_rows:
-            best, most = sign, typical
+        if typical < 2 or np.mean(np.array(counts) == typical) <= SNIFFING.most_rows:
+            continue
+        rank = len(next(csv.reader([first], delimiter=sign))) == typical, typical
+        if rank > most:
+            best, most = sign, rank
     return best
+
+
+def without_units(frame: pd.DataFrame, decimal: str) -> tuple[pd.DataFrame, str]:
+    """A table without a row of units under its header, and that row as text, "" where there is none.
+
+    Such a row holds no number while the row below it does.
+
+    Args:
+      frame: as `read_table_file` gives it. decimal: sign in numbers, which a column with such a row holds as text.
+    """
+
+    def number(cells: pd.Series, sign: str = decimal) -> pd.Series:
+        return pd.to_numeric(cells.astype(str).str.strip().str.replace(sign, ".", regex=False), errors="coerce")
+
+    if len(frame) < 2 or any(c.dtype.kind not in "OUTS" and c.notna().any() for _, c in frame.items()):
+        return frame, ""
+    top = frame.iloc[0].map(lambda cell: "" if pd.isna(cell) else str(cell).strip())
+    # A comma in the numbers may be a decimal one that the map does not state yet.
+    if number(top, ",").notna().any() or not number(frame.iloc[1], ",").notna().any():
+        return frame, ""
+    rest = frame.iloc[1:].reset_index(drop=True)
+    for column in rest.columns:
+        values = number(rest[column])
+        # What holds text below it as well stays text, for a sentence that names the cell.
+        if (values.notna() | rest[column].isna()).all():
+            rest[column] = values
+    return rest, ", ".join(text for text in top if text)
 
 
 def _matlab(path: Path, wanted: Sequence[str]) -> pd.DataFrame:
