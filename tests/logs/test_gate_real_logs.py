@@ -157,3 +157,43 @@ def test_the_advice_on_a_sparse_channel_passes_next(tmp_path: Path) -> None:
     tables["drive"] = tables["drive"].drop(columns="yaw_deg")
     write_log(tmp_path / "b", {**tables, "compass": yaw}, rover="luvmi_x", gravity_m_s2=9.81, on_change=("compass",))
     assert check(read_log(tmp_path / "b")) == []
+
+
+def turning(folder: Path, rates: tuple[float, float], wrong: float = 1.0, sideways: float = 0.0) -> Log:
+    """6 s of wheels at constant rates, rad/s; yaw that changes `wrong` times as fast; a rover that slips sideways."""
+    t = 0.05 * np.arange(120)
+    rng = np.random.default_rng(1)
+    rate = 0.4 * RADIUS * (rates[1] - rates[0]) / TRACK * np.ones(len(t))
+    yaw = np.cumsum(rate) * 0.05
+    ahead = 0.5 * RADIUS * (rates[0] + rates[1])
+    x = np.cumsum(ahead * np.cos(yaw) - sideways * np.sin(yaw)) * 0.05
+    y = np.cumsum(ahead * np.sin(yaw) + sideways * np.cos(yaw)) * 0.05
+    columns = {
+        "time_s": t,
+        "joint_left_drive_speed_rad_s": rates[0] + 0.02 * rng.normal(size=len(t)),
+        "joint_right_drive_speed_rad_s": rates[1] + 0.02 * rng.normal(size=len(t)),
+        "position_x_m": x + 1e-3 * rng.normal(size=len(t)),
+        "position_y_m": y + 1e-3 * rng.normal(size=len(t)),
+        "yaw_deg": np.degrees(yaw) * wrong,
+        "gyro_z_rad_s": rate + 1e-3 * rng.normal(size=len(t)),
+    }
+    source = {"files": "all.csv"}
+    write_log(folder, {"drive": pd.DataFrame(columns)}, rover="husky", imposed="wheel_speed", source=source)
+    log = read_log(folder)
+    assert isinstance(log, Log)
+    return log
+
+
+def test_a_rover_that_turns_about_itself_may_slip_sideways(tmp_path: Path) -> None:
+    assert not is_bad(check(turning(tmp_path / "pivot", (-3.0, 2.0), sideways=0.1)))
+    # driving ahead, the same says that the axes are not the schema's
+    assert is_bad(check(turning(tmp_path / "ahead", (2.0, 2.2), sideways=1.0)))
+
+
+@pytest.mark.parametrize(("many", "bad"), [(2, False), (12, True)])
+def test_what_few_pieces_of_a_recording_show_is_no_mistake_of_its_map(many: int, bad: bool, tmp_path: Path) -> None:
+    pieces = [turning(tmp_path / f"p{k:02d}", (-2.0, 2.0), 1.6 if k < many else 1.0) for k in range(30)]
+    found = check(pieces)
+    assert len(found) == many and is_bad(found) == bad
+    assert bad or all("2 of the 30 pieces of its recording show it" in f.message for f in found)
+    assert is_bad(check(pieces[:1])), "alone it is the recording"

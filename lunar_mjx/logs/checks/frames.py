@@ -462,12 +462,15 @@ def _course(log: Log) -> list[Finding]:
         return []
     windows = edges(*limits)
     east, north = (increments(log, n, windows) for n in names[:2])
-    spin = np.mean([means(log, d, windows) for d in drives], axis=0)
+    sides = [np.mean([means(log, d, windows) for d in side], axis=0) for side in _side_speeds(log)]
+    spin = 0.5 * (sides[0] + sides[1])
     turned = np.abs(increments(log, "yaw_deg", windows))
     # Backing up, course and heading point opposite ways by right.
     moved = np.hypot(east, north) * np.sign(spin)
     keep = np.abs(moved) > max(20.0 * sigma(log, names[0]), 1e-3)
     keep &= (np.abs(spin) > FRAME_LIMITS.turning) & (turned < FRAME_LIMITS.straight)
+    # Where the sides turn against each other, slip decides where to the rover moves, however slowly it turns.
+    keep &= sides[0] * sides[1] > 0.0
     heading = np.radians(means(log, "yaw_deg", windows))
     along, across = east * np.cos(heading) + north * np.sin(heading), north * np.cos(heading) - east * np.sin(heading)
     # Angle of the course off the heading, in the direction that the wheels drive.
