@@ -32,12 +32,16 @@ _ = Path("scout.urdf").write_text(
 
 # %% [markdown]
 # The converter finds the wheels by themselves and says what it assumed. Motors, springs and loops that a URDF cannot
-# express go into `scout.rover.toml` beside it; here the motor's gear is enough.
+# express go into `scout.rover.toml` beside it. Here the gear and the winding of a maxon ECX TORQUE 22 XL are enough;
+# `torque_constant_Nm_A`, `resistance_ohm` and `current_limit_A` describe another motor. State what a current is worth
+# (torque constant and gear) if logs with currents are to be read: what is left out is assumed, and told as a note.
 
 # %%
 from lunar_mjx.rover import convert, load_rover
 
-_ = Path("scout.rover.toml").write_text('[joints.drive]\nmode = "velocity"\nvelocity_gain = 8.0\ngear_ratio = 111.0\n')
+_ = Path("scout.rover.toml").write_text(
+    '[joints.drive]\nmode = "velocity"\nvelocity_gain = 8.0\ngear_ratio = 111.0\nwinding = 48\n'
+)
 convert("scout.urdf", "scout")
 rover = load_rover("scout")
 print(f"{rover.name}: {rover.mass:g} kg, wheels {[w.corner for w in rover.wheels]}, radius {rover.wheels[0].radius} m")
@@ -46,6 +50,19 @@ for note in rover.notes:
 assert rover.mass == 14 + 4 * 0.8 and len(rover.joints) == 4
 
 # %% [markdown]
+# Each wheel has a motor of its own. Where one motor drives all wheels of a side through chains, say so, and give the
+# sides' motors in `[joints.drive]` (Husky: `models/husky/husky.rover.toml`):
+#
+# ```toml
+# gravity = 9.81          # m/s2; the Moon's if left out
+# [[drive_groups]]
+# name = "left"
+# wheels = ["lf", "lr"]   # of six wheels ["lf", "lm", "lr"]
+# [[drive_groups]]
+# name = "right"
+# wheels = ["rf", "rr"]
+# ```
+#
 # It runs on every engine. The reference engine, native MuJoCo in float64, needs no compilation: the right wheels faster
 # than the left turn the rover to the left.
 

@@ -8,6 +8,9 @@ The ground is a plane under the wheels. Its slope enters as the direction of gra
 accelerometer measures or a map gives, so that a window needs no position.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo is a compiled module without type stubs)
+
 from __future__ import annotations
 
 import dataclasses
@@ -15,6 +18,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from lunar_mjx.dynamics.batching.batch_last import batch_last
@@ -101,16 +105,27 @@ def on_a_plane(model: Model) -> Model:
 
 
 def require_drives_alone(model: Model) -> None:
-    """Refuses rovers whose wheels are steered or sprung by actuators.
+    """Refuses rovers with joints beside their drives: steered wheels, suspensions, rockers that turn freely.
 
     Raises:
-      UserError: the rover has joints beside its drives, which imposed wheel speeds do not move.
+      UserError: the rover has such joints, which imposed wheel speeds do not move.
     """
     if any(g.name != "drive" for g in model.rover.groups):
         joints = ", ".join(j for g in model.rover.groups if g.name != "drive" for j in g.joints)
         raise UserError(
             f"{model.rover.name}: imposed wheel speeds need a rover whose drives are its only joints, and it has "
             f"{joints}; leave `imposed` out of log.toml, so that its commands are simulated."
+        )
+    compiled = model.rover.compile()
+    passive = [
+        compiled.joint(k).name
+        for k in range(compiled.njnt)
+        if compiled.jnt_type[k] != mujoco.mjtJoint.mjJNT_FREE and compiled.joint(k).name not in model.rover.joints
+    ]
+    if passive:
+        raise UserError(
+            f"{model.rover.name}: imposed wheel speeds need a rover whose drives are its only joints, and it has "
+            f'{", ".join(passive)}; write type="fixed" for them in its URDF and convert it again.'
         )
 
 

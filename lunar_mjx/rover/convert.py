@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from lunar_mjx.errors import UserError, bad_input, one_line
 from lunar_mjx.files import replacing
 from lunar_mjx.rover.couplings import place_couplings
-from lunar_mjx.rover.description import GROUPS, HEAVIEST, Description, read_description
+from lunar_mjx.rover.description import GROUPS, HEAVIEST, Description, GroupDescription, read_description
 from lunar_mjx.rover.load import FORMAT, MARKER, load_rover
 from lunar_mjx.rover.loops import PlacedLoop, place_loops
 from lunar_mjx.rover.mjcf import build_spec, scene_of, ties, to_xml
@@ -251,11 +251,7 @@ def _record(
         motor = ("torque_constant", group_fields.torque_constant_Nm_A), ("resistance", group_fields.resistance_ohm)
         stated = {k: v for k, v in (*motor, ("current_limit", group_fields.current_limit_A)) if v is not None}
         groups[group].update(stated)
-        if group not in description.stated:
-            notes.append(
-                f"{group}: assumed the motor maxon ECX TORQUE 22 XL, {group_fields.winding} V, behind a gear of "
-                f"{group_fields.gear_ratio:g}; state the real one in [joints.{group}] of the description"
-            )
+        notes += _assumed(group, group_fields, description.stated.get(group, frozenset()))
     return {
         "format": FORMAT,
         "name": name,
@@ -281,6 +277,18 @@ def _record(
             for x in loops
         ],
     }
+
+
+def _assumed(group: str, fields: GroupDescription, stated: frozenset[str]) -> list[str]:
+    """What of a joint group's torque for a current nobody stated: its motor, its gear, or both."""
+    motor = stated.isdisjoint(("winding", "torque_constant_Nm_A"))
+    gear = "gear_ratio" not in stated
+    if not motor and not gear:
+        return []
+    named = f"the motor maxon ECX TORQUE 22 XL, {fields.winding} V"
+    what = " behind ".join([named] * motor + [f"a gear of {fields.gear_ratio:g}"] * gear)
+    keys = " and ".join(["torque_constant_Nm_A (or winding)"] * motor + ["gear_ratio"] * gear)
+    return [f"{group}: assumed {what}; state {keys} in [joints.{group}] of the description"]
 
 
 def place_drive_groups(urdf: Urdf, roles: Roles, description: Description) -> tuple[DriveGroup, ...]:

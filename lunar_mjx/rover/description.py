@@ -98,7 +98,7 @@ def _default_groups() -> dict[str, GroupDescription]:
 
 @dataclass(frozen=True)
 class Description:
-    """Everything the converter is told beyond the URDF; `stated` are the joint groups that it describes."""
+    """Everything the converter is told beyond the URDF; `stated` are the keys that it describes of each joint group."""
 
     path: Path | None = None
     name: str | None = None
@@ -112,7 +112,7 @@ class Description:
     drive_groups: tuple[DriveGroupDescription, ...] = ()
     differentials: tuple[DifferentialDescription, ...] = ()
     groups: dict[str, GroupDescription] = field(default_factory=_default_groups)
-    stated: frozenset[str] = frozenset()
+    stated: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
 
 _TOP = {
@@ -166,7 +166,7 @@ def read_description(path: str | Path) -> Description:
     for name, table in joints.items():
         # What a table leaves out keeps the group's default, not the class's.
         groups[name] = _group(path, f"joints.{name}", table, groups[name])
-    return Description(**given, groups=groups, stated=frozenset(joints))
+    return Description(**given, groups=groups, stated={name: frozenset(table) for name, table in joints.items()})
 
 
 def _wheel(path: Path, where: str, table: Mapping[str, Any]) -> WheelDescription:

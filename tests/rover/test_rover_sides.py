@@ -75,6 +75,13 @@ def test_convert_says_which_motor_it_assumed(tmp_path):
     shutil.copy(shipped("models") / "husky" / "husky.urdf", tmp_path)
     rover = convert(tmp_path / "husky.urdf", tmp_path / "out")
     assert any("assumed the motor" in note and "243" in note for note in rover.notes)
+    told = tmp_path / "husky.rover.toml"
+    told.write_text("[joints.drive]\nvelocity_gain = 8.0\ngear_ratio = 78.0\n")
+    rover = convert(tmp_path / "husky.urdf", tmp_path / "gear")
+    assert [n for n in rover.notes if "assumed the motor" in n and "torque_constant_Nm_A" in n and "243" not in n]
+    told.write_text("[joints.drive]\ntorque_constant_Nm_A = 0.044\n")
+    rover = convert(tmp_path / "husky.urdf", tmp_path / "motor")
+    assert [n for n in rover.notes if "assumed a gear of 243" in n and "gear_ratio" in n and "motor" not in n]
     assert not any("assumed" in note for note in load_rover("husky").notes)
     assert dataclasses.replace(rover).gravity == 1.625
 

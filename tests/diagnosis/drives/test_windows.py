@@ -34,6 +34,7 @@ from lunar_mjx.logs import read_campaign
 from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.model.hard_floor import hard_floor
 from lunar_mjx.resources import shipped
+from lunar_mjx.rover import convert
 
 pytestmark = pytest.mark.optimised
 RADIUS, SAMPLES, INTERVAL = 0.165, 8, 0.15
@@ -360,6 +361,17 @@ def test_wheels_with_a_motor_each_and_no_imu(tmp_path, model):
     assert "calibration.current_difference" in names
 
 
+def test_currents_of_a_part_of_a_sides_wheels_are_refused(tmp_path, model):
+    time = np.arange(0.0, 10.0, 0.1)
+    columns = {"time_s": time, "joint_left_drive_speed_rad_s": 3.0 + np.sin(time)}
+    columns["joint_right_drive_speed_rad_s"] = columns["joint_left_drive_speed_rad_s"]
+    columns |= {f"motor_{corner}_drive_current_A": np.ones(len(time)) for corner in ("lf", "rf", "rr")}
+    log = write_drive(tmp_path / "part", columns)
+    told = "motor_lr_drive_current_A = None is missing beside motor_lf_drive_current_A; .*motor_left_drive_current_A"
+    with pytest.raises(UserError, match=told):
+        cut([log], corners(model), RADIUS, 10)
+
+
 def test_poses_tell_the_speed_ahead(tmp_path, model):
     """Without currents: the speed over ground along the chassis, from positions and heading."""
     time = np.arange(0.0, 8.0, 0.05)
@@ -426,6 +438,24 @@ def test_sizes_follow_the_rover():
     assert large["mass"] > small["mass"]
 
 
+@pytest.mark.parametrize(
+    ("note", "std"),
+    [
+        ("drive: assumed the motor X; state torque_constant_Nm_A", coordinates.ASSUMED_MOTOR),
+        ("drive: assumed a gear of 243; state gear_ratio", coordinates.ASSUMED_GEAR),
+        (
+            "drive: assumed the motor X behind a gear of 243",
+            np.hypot(coordinates.ASSUMED_MOTOR, coordinates.ASSUMED_GEAR),
+        ),
+        ("steer: assumed the motor X behind a gear of 1526", 0.05),
+    ],
+)
+def test_what_a_current_is_worth_is_known_as_well_as_it_was_stated(model, note, std):
+    rover = dataclasses.replace(model.rover, notes=(note,))
+    known = {q.key: q for q in coordinates.data_sheet(dataclasses.replace(model, rover=rover))}
+    assert known["motor.torque_constant"].std == pytest.approx(std)
+
+
 def test_what_is_known_is_fitted_no_further(model):
     """A prior is in the parameter's unit; what is fixed is no unknown any more; what is not plausible is refused."""
     known = coordinates.with_knowledge(model, {"hard_ground.mu": (0.5, 0.05), "motor.gear_efficiency": (0.65, 0.0)})
@@ -443,6 +473,23 @@ def test_what_is_known_is_fitted_no_further(model):
 def test_a_steered_rover_is_refused():
     with pytest.raises(UserError, match="drives are its only joints"):
         corners(hard_floor("luvmi_x"))
+
+
+def test_a_rover_on_free_rockers_is_refused_with_the_remedy(tmp_path):
+    """Its rockers have no actuator, so that no group of joints names them."""
+    text = (shipped("models") / "husky" / "husky.urdf").read_text()
+    for wheel in ("lf", "lr"):
+        text = text.replace(
+            f'<parent link="chassis"/>\n    <child link="{wheel}', f'<parent link="rocker"/>\n    <child link="{wheel}'
+        )
+    rocker = """<link name="rocker"><inertial><mass value="3"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="pivot" type="revolute"><parent link="chassis"/><child link="rocker"/><axis xyz="0 1 0"/>
+      <limit lower="-0.1" upper="0.1" effort="1" velocity="1"/></joint></robot>"""
+    (tmp_path / "husky.urdf").write_text(text.replace("</robot>", rocker))
+    convert(tmp_path / "husky.urdf", tmp_path / "out")
+    with pytest.raises(UserError, match='only joints, and it has pivot; write type="fixed" for them in its URDF'):
+        corners(hard_floor(tmp_path / "out"))
 
 
 def test_a_name_that_does_not_help_what_was_held_out_is_taken_back(monkeypatch):

@@ -68,6 +68,9 @@ def _shift(
 ASSUMED_MOTOR = 0.5
 """Standard deviation of the logarithm of a torque constant that `convert` assumed: motors of one size
 differ by half."""
+ASSUMED_GEAR = 1.0
+"""The same of a gear that `convert` assumed: those of wheels go from 20 to 250. The torque constant stands for both,
+since currents tell their product alone."""
 
 ROVER = (
     _factor("motor", "torque_constant", 0.05, 1e-3, 1.0, "N m/A"),
@@ -231,13 +234,17 @@ def data_sheet(model: Model, logs: Sequence[Log] = ()) -> tuple[Unknown, ...]:
     """What is open of a rover and its instruments before any log: `ROVER` and `SENSORS` in physical units.
 
     Args:
-      model: its rover gives the sizes; a motor that `convert` assumed is known badly.
+      model: its rover gives the sizes; a motor or gear that `convert` assumed is known badly.
       logs: state how well their IMU's mounting is known.
     """
     size = sizes(model)
     found = {u.key: _of_rover(u, size) for u in (*ROVER, *SENSORS)}
-    if any("assumed the motor" in note for note in model.rover.notes):
-        found["motor.torque_constant"] = dataclasses.replace(found["motor.torque_constant"], std=ASSUMED_MOTOR)
+    assumed = [note for note in model.rover.notes if note.startswith("drive: assumed")]
+    spread = math.hypot(
+        *(std for what, std in (("motor", ASSUMED_MOTOR), ("gear", ASSUMED_GEAR)) if any(what in n for n in assumed))
+    )
+    if spread:
+        found["motor.torque_constant"] = dataclasses.replace(found["motor.torque_constant"], std=spread)
     for axis, key in enumerate((f"{CALIBRATION}.roll", f"{CALIBRATION}.pitch")):
         stated = [log.imu.mounting_std_deg[axis] for log in logs if log.imu.mounting_std_deg[axis] > 0.0]
         if stated:

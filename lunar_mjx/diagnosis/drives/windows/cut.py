@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lunar_mjx.dynamics.imposed import Windows
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.logs import Log
 
 
@@ -339,7 +339,7 @@ def _windows(
         if channel == GYRO and found is not None:
             found = _upright(log, found)
         if found is None and channel in CURRENTS:
-            found = _sum_of_wheels(log, channel)
+            found = _sum_of_wheels(log, channel, joints)
         if found is None and channel == GYRO:
             found = _turning(log)
         if found is None and channel == AHEAD:
@@ -381,8 +381,25 @@ def _of_wheels(log: Log, channel: str) -> list[str]:
     return [c for c in (f"motor_{side}{row}_drive_current_A" for row in "fmr") if c in known]
 
 
-def _sum_of_wheels(log: Log, channel: str) -> tuple[np.ndarray, np.ndarray] | None:
-    parts = [log.channel(c) for c in _of_wheels(log, channel)]
+def _sum_of_wheels(log: Log, channel: str, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray] | None:
+    """A side's current as the sum of its wheels'; None where none of them was measured.
+
+    Raises:
+      UserError: some of the side's wheels have a current and others have none.
+    """
+    wheels = _of_wheels(log, channel)
+    side = channel.split("_")[1]
+    lacking = [n for j in joints if j.startswith(side[0]) and (n := f"motor_{j}_current_A") not in wheels]
+    if wheels and lacking:
+        # The sum of a part would be held against the current of all.
+        raise bad_input(
+            log.folder,
+            lacking[0],
+            None,
+            f"is missing beside {wheels[0]}",
+            f"map the current of every wheel of the {side} side, or of its one motor as {channel}",
+        )
+    parts = [log.channel(c) for c in wheels]
     found = [f for f in parts if f is not None and len(f[0]) > 1]
     if not found:
         return None
