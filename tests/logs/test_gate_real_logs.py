@@ -197,3 +197,14 @@ def test_what_few_pieces_of_a_recording_show_is_no_mistake_of_its_map(many: int,
     assert len(found) == many and is_bad(found) == bad
     assert bad or all("2 of the 30 pieces of its recording show it" in f.message for f in found)
     assert is_bad(check(pieces[:1])), "alone it is the recording"
+
+
+def test_gravity_is_asked_where_attitude_begins_later(tmp_path: Path) -> None:
+    t = 0.05 * np.arange(60)
+    force = {f"accelerometer_{a}_m_s2": np.full(60, v) for a, v in zip("xyz", (0.1, 0.2, -9.8), strict=True)}
+    angles = {f"{a}_deg": 0.1 * np.sin(t[2:]) for a in ("roll", "pitch", "yaw")}
+    force |= {f"joint_{side}_drive_speed_rad_s": np.full(60, 2.0) for side in ("left", "right")}
+    tables = {"imu": pd.DataFrame({"time_s": t} | force), "pose": pd.DataFrame({"time_s": t[2:]} | angles)}
+    write_log(tmp_path / "a", tables, rover="husky", gravity_m_s2=9.81, imposed="wheel_speed")
+    log = read_log(tmp_path / "a")
+    assert any(f.kind == "gravity" and "upside down" in f.message for f in check(log))

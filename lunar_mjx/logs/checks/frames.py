@@ -177,8 +177,12 @@ def _gravity(log: Log) -> list[Finding]:
     w, x, y, z = (np.full(1, v) for v in log.imu.quaternion)
     measured = measured @ _rotation(w, x, y, z)[0].T
     turn = attitude(log, time)
+    if turn is not None:
+        # A table of attitude may begin later or end sooner than the accelerometer's.
+        both = np.isfinite(turn).all(axis=(1, 2))
+        turn, measured = (turn[both], measured[both]) if both.any() else (None, measured)
     # The last row of body-to-world is the world's z in the body's axes.
-    up = np.tile([0.0, 0.0, 1.0], (len(time), 1)) if turn is None else turn[:, 2, :]
+    up = np.tile([0.0, 0.0, 1.0], (len(measured), 1)) if turn is None else turn[:, 2, :]
     # Medians, because a drive over boulders has jolts of many g.
     force, expected = np.median(measured, axis=0), np.median(up, axis=0)
     size, g = float(np.linalg.norm(force)), log.gravity_m_s2
@@ -193,7 +197,8 @@ def _gravity(log: Log) -> list[Finding]:
                 "gravity",
                 f"the accelerometer reads ({shown}) m/s2 where +g along the "
                 "body's z "
-                "belongs: its sign is reversed; specific force points up at rest",
+                "belongs: its sign is reversed; specific force points up at rest (an IMU that hangs upside down: "
+                "quaternion = [0, 1, 0, 0] in [imu])",
             )
         ]
     if abs(size / g - 1.0) > FRAME_LIMITS.gravity_tolerance + 6.0 * max(sigma(log, n) for n in names) / g / 20.0:
