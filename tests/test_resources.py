@@ -23,7 +23,9 @@ def test_a_path_is_found_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["moonbuggy", "", "viper/viper.xml"])
 def test_unknown_name_lists_what_ships(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"rover\.toml; shipped with the package: .*luvmi_x, rocker_bogie, viper\.$"):
+    with pytest.raises(
+        UserError, match=r"rover\.toml; shipped with the package: .*luvmi_x, rocker_bogie, viper, warthog\.$"
+    ):
         resources.find("models", name, "rover.toml")
 
 

@@ -369,11 +369,25 @@ def test_bad_maps_are_answered_in_one_sentence(
 
 
 def test_shipped_maps_are_read_by_name(tmp_path: Path) -> None:
-    assert {"husky_borealtc", "husky_drive", "cuadriga_camis"} <= set(shipped_maps())
+    assert {"husky_borealtc", "husky_drive", "cuadriga_camis", "warthog_drive"} <= set(shipped_maps())
     for name in shipped_maps():
         assert read_map(name).tables
     with pytest.raises(UserError, match=r"neither a map file nor a shipped map; shipped are .*husky_borealtc"):
         read_map("no_such_map")
+
+
+def test_a_warthog_is_read_in_the_columns_of_drive(tmp_path: Path) -> None:
+    t = np.tile(0.05 * np.arange(40), 2)
+    names = "cmd_left_rad_s,cmd_right_rad_s,wheel_left_rad_s,wheel_right_rad_s,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad"
+    columns = {name: np.zeros(80) for name in (*names.split(","), "imu_yaw", "ax", "ay")}
+    columns |= {"window": np.repeat([0, 1], 40), "t_s": t, "az": np.full(80, 9.8), "wheel_left_rad_s": np.sin(t)}
+    pd.DataFrame(columns).to_csv(tmp_path / "asphalt.csv", index=False)
+    changes = {"ground": "asphalt", "imu": {"quaternion": [0, 1, 0, 0]}}
+    found = import_drives(tmp_path / "asphalt.csv", tmp_path / "logs", "warthog_drive", changes=changes)
+    log = drive(found.logs[1])
+    assert len(found.logs) == 2 and log.rover == "warthog" and log.ground == "asphalt"
+    assert tuple(log.imu.quaternion) == (0.0, 1.0, 0.0, 0.0)
+    assert log.channel("joint_left_drive_speed_rad_s") is not None
 
 
 def test_dates_count_from_the_first(tmp_path: Path) -> None:

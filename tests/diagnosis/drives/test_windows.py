@@ -415,9 +415,10 @@ def test_nothing_to_judge_by_is_refused(tmp_path, model):
         cut([log], corners(model), RADIUS, 10)
 
 
-def test_the_husky_file_is_the_hard_floor_of_any_rover(model):
-    """`models/husky/hard_floor.toml` spells out what `hard_floor` derives from a rover's weight and size."""
-    derived = hard_floor("husky")
+@pytest.mark.parametrize("rover", ["husky", "warthog"])
+def test_shipped_files_are_the_hard_floor_of_any_rover(rover):
+    """`hard_floor.toml` of a rover's folder spells out what `hard_floor` derives from its weight and size."""
+    derived, model = hard_floor(rover), load_model(shipped("models") / rover / "hard_floor.toml")
     assert [e.name for e in derived.effects] == [e.name for e in model.effects]
     for name in ("hard_ground", "coulomb_friction", "viscous_friction"):
         for key, value in derived.parameters[name].items():
