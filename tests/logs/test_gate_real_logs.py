@@ -208,3 +208,15 @@ def test_gravity_is_asked_where_attitude_begins_later(tmp_path: Path) -> None:
     write_log(tmp_path / "a", tables, rover="husky", gravity_m_s2=9.81, imposed="wheel_speed")
     log = read_log(tmp_path / "a")
     assert any(f.kind == "gravity" and "upside down" in f.message for f in check(log))
+
+
+def test_one_current_under_two_names_is_found(tmp_path: Path) -> None:
+    """A total that is written for both sides, or a side's for each of its wheels, would count twice."""
+
+    def total(tables: dict[str, pd.DataFrame]) -> None:
+        left, right = (f"motor_{side}_drive_current_A" for side in ("left", "right"))
+        tables["drive"][left] = tables["drive"][right] = 0.5 * (tables["drive"][left] + tables["drive"][right])
+
+    found = check(make(tmp_path / "a", total))
+    assert [f.kind for f in found] == ["copy"] and is_bad(found)
+    assert "equals motor_left_drive_current_A in all 1200 rows" in found[0].message

@@ -39,6 +39,9 @@ class MotorLimits:
     """s between looks at temperatures: heat moves in seconds."""
     heat_least: float = 20.0
     """s of temperatures that tell whether a winding warms by its current: about two of its time constants."""
+    same_values: int = 20
+    """Different values of two currents that are equal row by row, from which one is a copy: rounded to 0.1 A, the
+    currents of two motors agree in one row of ten or so."""
 
 
 MOTOR_LIMITS = MotorLimits()
@@ -46,7 +49,7 @@ MOTOR_LIMITS = MotorLimits()
 
 def check_motors(log: Log) -> list[Finding]:
     """Findings on every joint's motor, and on pairs of corners whose channels may be swapped."""
-    findings = _against(log)
+    findings = _against(log) + _copies(log)
     for kind in ("drive", "steer", "sus"):
         for quantity in ("speed_rad_s", "angle_rad"):
             findings += _follows(log, kind, quantity)
@@ -60,6 +63,21 @@ def _present(log: Log, pattern: str) -> dict[str, str]:
     """Channels of a pattern by corner, or by side."""
     names = {c: pattern.format(c) for c in (*CORNERS, *SIDES)}
     return {c: n for c, n in names.items() if continuous(log, n) is not None}
+
+
+def _copies(log: Log) -> list[Finding]:
+    """Findings of currents of two motors that are one reading: a side's or the rover's, written under several names."""
+    names = list(_present(log, "motor_{}_drive_current_A").values())
+    findings = []
+    for k, name in enumerate(names):
+        values = known(log, name)[1]
+        twins = (n for n in names[:k] if np.array_equal(values, known(log, n)[1]))
+        twin = next(twins, None) if len(np.unique(values)) >= MOTOR_LIMITS.same_values else None
+        if twin is not None:
+            text = f"equals {twin} in all {len(values)} rows: two motors never draw the same; map each motor's own"
+            remedy = "reading, a side's once as motor_left_drive_current_A, and leave out one of all motors together"
+            findings.append(_finding(log, name, "copy", f"{text} {remedy}"))
+    return findings
 
 
 def _against(log: Log) -> list[Finding]:
