@@ -8,9 +8,6 @@ The ground is a plane under the wheels. Its slope enters as the direction of gra
 accelerometer measures or a map gives, so that a window needs no position.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo is a compiled module without type stubs)
-
 from __future__ import annotations
 
 import dataclasses
@@ -18,7 +15,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from lunar_mjx.dynamics.batching.batch_last import batch_last
@@ -116,12 +112,7 @@ def require_drives_alone(model: Model) -> None:
             f"{model.rover.name}: imposed wheel speeds need a rover whose drives are its only joints, and it has "
             f"{joints}; leave `imposed` out of log.toml, so that its commands are simulated."
         )
-    compiled = model.rover.compile()
-    passive = [
-        compiled.joint(k).name
-        for k in range(compiled.njnt)
-        if compiled.jnt_type[k] != mujoco.mjtJoint.mjJNT_FREE and compiled.joint(k).name not in model.rover.joints
-    ]
+    passive = [joint for joint in model.rover.joint_limits if joint not in model.rover.joints]
     if passive:
         raise UserError(
             f"{model.rover.name}: imposed wheel speeds need a rover whose drives are its only joints, and it has "

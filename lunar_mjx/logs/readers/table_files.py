@@ -164,7 +164,8 @@ def without_units(frame: pd.DataFrame, decimal: str) -> tuple[pd.DataFrame, str]
     """
 
     def number(cells: pd.Series, sign: str = decimal) -> pd.Series:
-        return pd.to_numeric(cells.astype(str).str.strip().str.replace(sign, ".", regex=False), errors="coerce")
+        text = cells.astype(str).str.strip().str.replace(sign, ".", regex=False)
+        return pd.Series(pd.to_numeric(text, errors="coerce"))
 
     if len(frame) < 2 or any(c.dtype.kind not in "OUTS" and c.notna().any() for _, c in frame.items()):
         return frame, ""
