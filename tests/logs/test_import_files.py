@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from lunar_mjx.logs.readers.clocks import TimeColumn, seconds
 from lunar_mjx.logs.readers.geodesy import tangent_plane, utm, utm_zone
 from lunar_mjx.logs.readers.held import held_samples
 from lunar_mjx.logs.readers.import_map import read_map, shipped_maps
+from lunar_mjx.resources import shipped
 from tests.cli_harness import Run
 
 MAP = """
@@ -374,6 +376,35 @@ def test_shipped_maps_are_read_by_name(tmp_path: Path) -> None:
         assert read_map(name).tables
     with pytest.raises(UserError, match=r"neither a map file nor a shipped map; shipped are .*husky_borealtc"):
         read_map("no_such_map")
+
+
+def test_a_rover_beside_its_map_is_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(shipped("models") / "husky", tmp_path / "mine" / "my_rover")
+    (tmp_path / "mine" / "a.txt").write_text("2 1 500 10:00:00.0\n4 1 600 10:00:00.5\n", encoding="utf-8")
+    mapping = write_map(tmp_path / "mine", MAP.replace('"luvmi_x"', '"my_rover"'))
+    # from the map's folder, and from another one
+    for k, place in enumerate((tmp_path / "mine", tmp_path)):
+        monkeypatch.chdir(place)
+        found = import_drives(tmp_path / "mine" / "a.txt", f"logs/{k}", mapping)
+        folder = found.folder.resolve()
+        monkeypatch.chdir("/")
+        assert Path(drive(folder).rover) == tmp_path / "mine" / "my_rover"
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        (
+            "joint_left_drive_speed_m_s",
+            "state one over the wheel's radius in m, as in joint_left_drive_speed_rad_s = {",
+        ),
+        ("accelerometer_x_g", "state the factor between the units, as in accelerometer_x_m_s2 = {"),
+        ("bus_current_A", "is no channel; list the names with lunar-mjx log channels"),
+    ],
+)
+def test_a_unit_that_does_not_convert_is_told_with_the_remedy(channel: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=re.escape(words)):
+        read_map(write_map(tmp_path, MAP.replace("motor_left_drive_current_mA", channel)))
 
 
 def test_a_warthog_is_read_in_the_columns_of_drive(tmp_path: Path) -> None:

@@ -429,6 +429,6 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
 
 def _near(folder: Path, spec: str, marker: str) -> str:
     """A path counted from the log's folder as an absolute one; a name as it is."""
-    near = folder.resolve() / spec
+    near = (folder / spec).resolve()
     # What lies beside the log wins over a shipped name: a log travels with its rover.
     return str(near) if near.is_file() or (near / marker).is_file() else spec

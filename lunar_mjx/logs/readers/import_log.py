@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -107,7 +108,7 @@ def import_drives(
             write_log(
                 place,
                 drive.tables,
-                rover=mapping.rover,
+                rover=_rover_from(place, mapping),
                 noise=mapping.noise,
                 clock_offsets_s=_offsets(drive, mapping),
                 on_change=drive.on_change,
@@ -116,6 +117,18 @@ def import_drives(
         )
     copies = _told([c for d in pieces for c in d.copies], len(usable))
     return Imported(folder, tuple(logs), tuple(notes), copies, tuple(d.seconds for d in usable))
+
+
+def _rover_from(place: Path, mapping: ImportMap) -> str:
+    """The map's rover as a log in a folder names it: a path counted from that folder, or a shipped name.
+
+    A path in a map counts from where the command runs, else from the map. The log is read from anywhere.
+    """
+    for base in (Path(), mapping.path.parent):
+        folder = base / mapping.rover
+        if (folder / "rover.toml").is_file():
+            return Path(os.path.relpath(folder.resolve(), place.resolve())).as_posix()
+    return mapping.rover
 
 
 def _told(copies: Sequence[Copies], drives: int) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.readers.clocks import FASTEST_HZ, UNITS, TimeColumn
 from lunar_mjx.logs.readers.folder import FARTHEST_M, TOP
 from lunar_mjx.logs.readers.table_files import SEPARATORS, Layout
-from lunar_mjx.logs.schema import NOISE_KEYS, NOISE_SOURCES, parse_column
+from lunar_mjx.logs.schema import NOISE_KEYS, NOISE_SOURCES, is_quantity, parse_column
 from lunar_mjx.toml_fields import Fields
 
 SHIPPED = Path(__file__).resolve().parent / "maps"
@@ -358,8 +358,14 @@ def _channels(channels: Fields) -> dict[str, Source]:
     for name, value in channels.values.items():
         column = parse_column(name, str(channels.path))
         if column is None or column.problem:
-            what = column.problem if column else "is no channel"
-            raise bad_input(channels.path, channels.prefix, name, what, "list the names with lunar-mjx log channels")
+            what, remedy = "is no channel", "list the names with lunar-mjx log channels"
+            if column is not None:
+                # Speeds of a rim are what many loggers write of a wheel.
+                rim = is_quantity(column.name, "joint_speed") and name.endswith("_m_s")
+                factor = "one over the wheel's radius in m" if rim else "the factor between the units"
+                what = column.problem
+                remedy = f'state {factor}, as in {column.name} = {{ column = "v", scale = FACTOR }}'
+            raise bad_input(channels.path, channels.prefix, name, what, remedy)
         if not isinstance(value, Mapping):
             found[name] = Source((Term(_column(channels, name)),))
             continue

@@ -277,6 +277,11 @@ def test_what_no_window_holds_is_named_with_the_reason(tmp_path):
     assert told == (
         "Not used: position_x_m, position_y_m (a speed over ground needs a heading that is known, yaw_deg)."
     )
+    table = logs[0] / "drive.csv"
+    table.write_text(table.read_text().replace("accelerometer_y_m_s2", "roll_deg"))
+    run = Run(tmp_path / "other", logs[:1], run.model)
+    told = Bench(run, run.campaign()).question([Noise(1.0, 0.0, 1.0)] * len(CHANNELS), ()).unused
+    assert "accelerometer_x_m_s2, accelerometer_z_m_s2 (the slope needs all three axes of it" in told
 
 
 def test_a_known_error_is_a_coloured_part_of_the_noise():

@@ -42,7 +42,10 @@ MOST_WINDOWS = 60
 """Windows of a campaign that are simulated: two minutes of driving, drawn evenly over speeds and turns."""
 
 
-UNUSED = {"position": "a speed over ground needs a heading that is known, yaw_deg"}
+UNUSED = {
+    "position": "a speed over ground needs a heading that is known, yaw_deg",
+    "accelerometer": "the slope needs all three axes of it, or roll and pitch",
+}
 """Why channels are in no window, by their quantity."""
 
 PARTS = 10
