@@ -218,6 +218,10 @@ def check(
         raise typer.Exit(BAD_DATA_STATUS)
 
 
+MOST_NAMED = 12
+"""Logs that are named one by one though nothing is found in them: a screen of them hides the others."""
+
+
 def _print_findings(logs: list[Any], found: list[Any]) -> None:
     from rich.markup import escape
 
@@ -225,7 +229,12 @@ def _print_findings(logs: list[Any], found: list[Any]) -> None:
     from lunar_mjx.model.describe import make_console, make_table
 
     console = make_console()
+    quiet = [log for log in logs if all(f.log != log.name for f in found)]
+    if len(quiet) <= MOST_NAMED:
+        quiet = []
     for log in logs:
+        if any(log is other for other in quiet):
+            continue
         mine = [f for f in found if f.log == log.name]
         if isinstance(log, SteadyLog):
             what = f"{len(log.table)} points"
@@ -241,6 +250,9 @@ def _print_findings(logs: list[Any], found: list[Any]) -> None:
             line = "" if f.line is None else str(f.line)
             table.add_row(mark, escape(f.table), line, escape(_short(f.column)), f.kind, escape(f.message))
         console.print(table)
+    if quiet:
+        which = "all" if len(quiet) == len(logs) else "the others"
+        console.print(f"{len(quiet)} of {len(logs)} logs ({which}): nothing found, fit to be used")
 
 
 def simulate(

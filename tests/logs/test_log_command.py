@@ -37,6 +37,22 @@ def test_check_says_fit_or_bad(run: Run, tmp_path: Path) -> None:
     assert [(f["log"], f["line"], f["kind"]) for f in found["findings"]] == [("bad", 11, "clock")]
 
 
+def test_check_tells_many_good_logs_in_one_line(run: Run, tmp_path: Path) -> None:
+    make_log(tmp_path / "campaign" / "log00")
+    for k in range(1, 14):
+        shutil.copytree(tmp_path / "campaign" / "log00", tmp_path / "campaign" / f"log{k:02d}")
+    result = run("log", "check", tmp_path / "campaign")
+    assert result.status == 0 and "14 of 14 logs (all): nothing found" in result.out and "log07" not in result.out
+
+    def spoil(tables: dict[str, pd.DataFrame]) -> None:
+        tables["drive"].loc[9, "time_s"] = 0.0
+
+    make_log(tmp_path / "campaign" / "bad", spoil)
+    result = run("log", "check", tmp_path / "campaign")
+    assert result.status == 10 and "goes back" in result.out
+    assert "14 of 15 logs (the others): nothing found" in result.out
+
+
 def test_check_asks_for_length(run: Run, tmp_path: Path) -> None:
     make_log(tmp_path / "a")
     assert run("log", "check", tmp_path / "a", "--slowest", "housing_radiation=600").status == 10
