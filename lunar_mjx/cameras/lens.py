@@ -127,7 +127,9 @@ class Lens:
         return bool((xx + yy > 0.0).all() and (xx * yy - xy * xy > 0.0).all())
 
 
-def lens_of(coefficients: Sequence[float], source: str = "lens", field: str = "coefficients") -> Lens | None:
+def lens_of(
+    coefficients: Sequence[float] | np.ndarray, source: str = "lens", field: str = "coefficients"
+) -> Lens | None:
     """The lens of OpenCV's `distCoeffs`, or `D` of a ROS `CameraInfo`; None if all are 0 or there are none.
 
     Args:
@@ -136,6 +138,8 @@ def lens_of(coefficients: Sequence[float], source: str = "lens", field: str = "c
     Raises:
       UserError: they are not numbers, or neither none, four nor five; OpenCV's models with eight and more are others.
     """
+    if isinstance(coefficients, np.ndarray):
+        coefficients = np.ravel(coefficients).tolist()  # OpenCV gives a row or a column
     if isinstance(coefficients, str) or not isinstance(coefficients, Sequence) or len(coefficients) not in (0, 4, 5):
         raise bad_input(
             source,

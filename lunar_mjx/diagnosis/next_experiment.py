@@ -120,9 +120,10 @@ def next_experiment(
     form.drives.progress = silent
     progress("what the logs say so far", 0.0)
     known = _Knowledge(form, run, usable)
-    plans = planned_drives(drives, run.model, seconds)
+    model = form.drives.model
+    plans = planned_drives(drives, model, seconds)
     effects_by_name = {n: form.drives.effects[n] for n in usable if n != NOTHING}
-    new = DriveProblem([p[2] for p in plans], run.model, effects_by_name, progress=progress)
+    new = DriveProblem([p[2] for p in plans], model, effects_by_name, progress=progress)
     ranked = _rank(new, known, usable, [(name, text) for name, text, _ in plans])
     experiment = NextExperiment(tuple(usable), tuple(ranked), _sentence(usable, ranked))
     run.save(NEXT_FILE, experiment.to_dict())

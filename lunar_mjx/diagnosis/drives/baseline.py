@@ -63,6 +63,10 @@ NOT_MISSING = frozenset(
 """Effects that describe an arrangement of the test, which its user knows, and are never candidates by themselves."""
 
 
+ASSUMED = "assumed_torque_per_ampere"
+"""Parameter of `joint_control` that holds what controllers expect of an ampere, N m; 0 where they know their motor."""
+
+
 def unfit(name: str, effect: Effect) -> str:
     """Why an effect is no candidate for drives, or ""."""
     del effect
@@ -73,18 +77,22 @@ def with_nominal_controller(model: Model) -> Model:
     """A model whose controllers reckon with the constants that its motors have now, as those of a data sheet.
 
     A refit moves the motors, and no controller knows what was built in: were it to follow, a motor that is 3 % stronger
-    would be asked for 3 % less current, and speeds and currents would contradict its torque. A model that states what
-    its controllers expect is left as it is.
+    would be asked for 3 % less current, and speeds and currents would contradict its torque. Joints whose controllers
+    are told what to expect are left as they are. So is a rover whose motor `convert` assumed: nobody's controller
+    reckons with that one.
     """
     if not {"motor", "joint_control"} <= set(model.effect_names):
         return model
-    if np.any(np.asarray(model.parameters["joint_control"]["assumed_torque_per_ampere"]) > 0.0):
+    if any(": assumed " in note for note in model.rover.notes):
         return model
     motor, joints = model.parameters["motor"], len(model.rover.joints)
+    told = np.broadcast_to(np.asarray(model.parameters["joint_control"][ASSUMED], float), joints)
+    if np.all(told > 0.0):
+        return model
     expected = np.ones(joints)
     for name in ("gear_ratio", "gear_efficiency", "torque_constant"):
         expected = expected * np.broadcast_to(np.asarray(motor[name], float), joints)
-    return model.set("joint_control", "compare", assumed_torque_per_ampere=expected)
+    return model.set("joint_control", "compare", **{ASSUMED: np.where(told > 0.0, told, expected)})
 
 
 def baseline_coordinates(model: Model, baseline: Mapping[str, Mapping[str, tuple[float, float]]]) -> list[Coordinate]:

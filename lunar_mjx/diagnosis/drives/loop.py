@@ -47,7 +47,8 @@ def build_drives(
     model = with_nominal_controller(run.model)
     drives = DriveProblem(logs, model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
     form = DriveForm(drives, settings, progress)
-    kept = kept_start(run, form, frozenset())
+    # what was kept of a model whose controllers followed its motors is another model's
+    kept = kept_start(run, form, frozenset()) if model is run.model else None
     if kept is not None:
         told = run.load(COMPARISON_FILE) or {}
         form.start, form.kept = kept, told if LEARNT.issubset(told) else {}
@@ -75,6 +76,7 @@ def grown_drives(
       values: parameters to hold at other than their fitted values. progress: told of the refit.
     """
     effects = {n: catalogue.get(n) for n in names}
+    run = dataclasses.replace(run, model=with_nominal_controller(run.model))
     model = run.model
     for name, effect in effects.items():
         model = model.add(name if ".py" in name else effect, "add", **values)

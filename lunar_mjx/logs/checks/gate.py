@@ -7,9 +7,9 @@ found here is wrong by its own channels, before any model of the rover is asked.
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from lunar_mjx.effects.body.chassis import payload_refusal
 from lunar_mjx.effects.catalogue import CATALOGUE
@@ -30,9 +30,9 @@ from lunar_mjx.terrain import load_terrain
 Slowest = Mapping[str, float]
 
 RARE = 0.1
-"""Share of the pieces of one recording up to which a frame, a unit or a swap that does not fit is no mistake of the
-recording: one map reads all pieces, so that its mistakes are in every piece in which the rover moves enough. A pose
-that jumps, or a rover that is pushed, is in a few (8 of 90 drives of 2.7 s with poses by lidar)."""
+"""Share of the pieces of one recording that could tell up to which a frame, a unit or a swap that does not fit is no
+mistake of the recording: one map reads all pieces, so that its mistakes are in every piece in which the rover moves
+enough. A pose that jumps, or a rover that is pushed, is in a few (8 of 90 drives of 2.7 s with poses by lidar)."""
 OF_THE_MAP = ("frame", "unit", "swap")
 """Kinds of findings that a map's mistake would bring into all pieces."""
 
@@ -49,32 +49,52 @@ def check(logs: Log | SteadyLog | Sequence[Log | SteadyLog], slowest_s: Slowest 
       Findings in the order of the logs; those of severity `BAD_DATA` make a log unusable. Empty for a good log.
     """
     log_list = [logs] if isinstance(logs, Log | SteadyLog) else list(logs)
-    findings: list[Finding] = []
-    for log in log_list:
-        findings += list(log.problems) + (check_steady(log) if isinstance(log, SteadyLog) else _check_drive(log))
-    return _of_pieces(findings, log_list) + _check_length(log_list, slowest_s or {})
+    found = [
+        list(log.problems) + (check_steady(log) if isinstance(log, SteadyLog) else _check_drive(log))
+        for log in log_list
+    ]
+    return _of_pieces(found, log_list) + _check_length(log_list, slowest_s or {})
 
 
-def _of_pieces(findings: Sequence[Finding], logs: Sequence[Log | SteadyLog]) -> list[Finding]:
-    """The findings, of which those that only few pieces of a recording show are warnings."""
-    recording = {log.name: (log.folder.resolve().parent, log.source.get("files", log.name)) for log in logs}
-    pieces = Counter(recording.values())
+def _of_pieces(found: Sequence[Sequence[Finding]], logs: Sequence[Log | SteadyLog]) -> list[Finding]:
+    """The findings of all logs, of which those that only few pieces of a recording show are warnings.
 
-    def key(finding: Finding) -> tuple[object, ...]:
-        return recording[finding.log], finding.kind, finding.table, finding.column
-
-    mine = [f for f in findings if f.kind in OF_THE_MAP and f.severity == BAD_DATA and f.log in recording]
-    showing = Counter(key(f) for f in {(f.log, *key(f)): f for f in mine}.values())
+    Args:
+      found: of each log. logs: as they are numbered there; names may repeat from campaign to campaign.
+    """
+    recording = [(log.folder.resolve().parent, log.source.get("files", number)) for number, log in enumerate(logs)]
+    showing: dict[tuple[Any, ...], set[int]] = {}
+    for number, findings in enumerate(found):
+        for f in findings:
+            if f.kind in OF_THE_MAP and f.severity == BAD_DATA:
+                showing.setdefault((recording[number], f.kind, f.table, f.column), set()).add(number)
+    told: dict[tuple[Any, ...], str] = {}
+    for key, seen in showing.items():
+        others = [k for k, r in enumerate(recording) if r == key[0] and k not in seen]
+        # Without enough pieces, none of them need be asked.
+        if len(seen) <= RARE * (len(seen) + len(others)):
+            told_by = len(seen) + sum(_could_tell(logs[k], key[2], key[3], found[k]) for k in others)
+            if len(seen) <= RARE * told_by:
+                told[key] = f"{len(seen)} of the {told_by} pieces of its recording that could show it do, and are used"
     out = []
-    for finding in findings:
-        among = pieces[recording[finding.log]] if finding.log in recording else 0
-        seen = showing[key(finding)] if finding in mine else among
-        if seen > RARE * among or not among:
-            out.append(finding)
-            continue
-        told = f"{finding.message}; {seen} of the {among} pieces of its recording show it, which are used all the same"
-        out.append(dataclasses.replace(finding, message=told, severity=WARNING))
+    for number, findings in enumerate(found):
+        for f in findings:
+            why = told.get((recording[number], f.kind, f.table, f.column))
+            out.append(f if why is None else dataclasses.replace(f, message=f"{f.message}; {why}", severity=WARNING))
     return out
+
+
+def _could_tell(log: Log | SteadyLog, table: str, column: str, found: Sequence[Finding]) -> bool:
+    """Whether a log in which a column is right would have shown it, had its sign been wrong: else it is no witness."""
+    if not isinstance(log, Log) or table not in log.tables or is_bad(found):
+        return False
+    own = log.tables[table]
+    channel = next((c for c in own.channels if own.columns.get(c, c) == column), None)
+    if channel is None:
+        return False
+    mirrored = dataclasses.replace(own, channels={**own.channels, channel: -own.channels[channel]})
+    other = dataclasses.replace(log, tables={**log.tables, table: mirrored})
+    return any(f.kind in OF_THE_MAP and f.severity == BAD_DATA for f in _check_drive(other))
 
 
 def require_named(logs: Sequence[Log | SteadyLog], slowest_s: Slowest) -> None:

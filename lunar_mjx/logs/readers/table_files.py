@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -172,6 +173,9 @@ def without_units(frame: pd.DataFrame, decimal: str) -> tuple[pd.DataFrame, str]
     top = frame.iloc[0].map(lambda cell: "" if pd.isna(cell) else str(cell).strip())
     # A comma in the numbers may be a decimal one that the map does not state yet.
     if number(top, ",").notna().any() or not number(frame.iloc[1], ",").notna().any():
+        return frame, ""
+    # A unit is a word; a clock and dashes for what is missing are a row of data.
+    if not any(re.search(r"[^\W\d_]|[%°]", text) for text in top):
         return frame, ""
     rest = frame.iloc[1:].reset_index(drop=True)
     for column in rest.columns:
