@@ -86,7 +86,7 @@ def _of_pieces(found: Sequence[Sequence[Finding]], logs: Sequence[Log | SteadyLo
 
 def _could_tell(log: Log | SteadyLog, table: str, column: str, found: Sequence[Finding]) -> bool:
     """Whether a log in which a column is right would have shown it, had its sign been wrong: else it is no witness."""
-    if not isinstance(log, Log) or table not in log.tables or is_bad(found):
+    if not isinstance(log, Log) or table not in log.tables or is_bad(list(found)):
         return False
     own = log.tables[table]
     channel = next((c for c in own.channels if own.columns.get(c, c) == column), None)
