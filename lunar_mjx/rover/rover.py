@@ -140,6 +140,11 @@ class Rover:
         # One order for controls, telemetry and parameters by joint: nothing in the package keeps another.
         return tuple(joint for group in self.groups for joint in group.joints)
 
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Notes of motors and gears that nobody stated and `convert` assumed; each begins with its joint group."""
+        return tuple(note for note in self.notes if ": assumed " in note)
+
     def group(self, name: str) -> JointGroup | None:
         """The group called `name`, or None if the rover has no such joints."""
         return next((g for g in self.groups if g.name == name), None)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from lunar_mjx.backends import POINTS, Hook, NativeBackend
-from lunar_mjx.diagnosis.drives.baseline import with_nominal_controller
+from lunar_mjx.diagnosis.drives.baseline import ASSUMED, with_nominal_controller
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
+from lunar_mjx.model.file import load_model, save_model
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +98,23 @@ def test_a_controller_asks_by_the_number_that_it_was_told(model):
     )
     np.testing.assert_allclose(told["current"], plain["current"], rtol=1e-9)
     np.testing.assert_allclose(knowing["current"], plain["current"] / 1.05, rtol=1e-9)
+
+
+def test_what_controllers_reckon_with_is_set_once_and_never_for_an_assumed_motor(tmp_path):
+    husky = make_model("husky", "flat")
+    known = with_nominal_controller(husky)
+    told = known.parameters["joint_control"][ASSUMED]
+    assert np.asarray(told) == pytest.approx(78.71 * 0.7 * 0.044)
+    save_model(known, tmp_path / "fitted.toml")
+    read = load_model(tmp_path / "fitted.toml")
+    assert read.parameters["joint_control"][ASSUMED] == pytest.approx(told)
+    # a refit has moved the motors since, and what their controllers expect stays
+    moved = read.set("motor", torque_constant=tuple(1.1 * k for k in read.parameters["motor"]["torque_constant"]))
+    assert with_nominal_controller(moved) is moved
+    some = husky.set("joint_control", **{ASSUMED: (1.0, 0.0, 0.0, 1.0)})
+    assert with_nominal_controller(some).parameters["joint_control"][ASSUMED] == pytest.approx((1.0, *told[1:3], 1.0))
+    warthog = make_model("warthog", "flat")
+    assert warthog.rover.assumed and with_nominal_controller(warthog) is warthog
 
 
 def test_the_cut_off_has_the_last_word(model):

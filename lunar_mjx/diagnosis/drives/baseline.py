@@ -83,7 +83,7 @@ def with_nominal_controller(model: Model) -> Model:
     """
     if not {"motor", "joint_control"} <= set(model.effect_names):
         return model
-    if any(": assumed " in note for note in model.rover.notes):
+    if model.rover.assumed:
         return model
     motor, joints = model.parameters["motor"], len(model.rover.joints)
     told = np.broadcast_to(np.asarray(model.parameters["joint_control"][ASSUMED], float), joints)

@@ -274,8 +274,8 @@ class DriveProblem:
         """(n,) change over a sample each way; of what jumps with a command, over the sample where it changes less.
 
         A jump is no slope: a current that was read before a command is no other where its clock is a millisecond off.
-        (The mean of both ways made 3 A of 4 ms at every jump of a Husky's commands, where its fit then left 60 sigma
-        and held two other parameters at their bounds.)
+        (By the mean of both ways a few milliseconds stood for 3 A at every jump of a Husky's commands: its fit left 60
+        sigma of such a reading, and held two other parameters at their bounds.)
         """
         bench = self._there
         interval = [run.every * run.model.timestep for run in bench.runs]

@@ -32,7 +32,7 @@ Slowest = Mapping[str, float]
 RARE = 0.1
 """Share of the pieces of one recording that could tell up to which a frame, a unit or a swap that does not fit is no
 mistake of the recording: one map reads all pieces, so that its mistakes are in every piece in which the rover moves
-enough. A pose that jumps, or a rover that is pushed, is in a few (8 of 90 drives of 2.7 s with poses by lidar)."""
+enough. A pose that jumps, or a rover that is pushed, is in a few (3 of 90 drives of 2.7 s with poses by lidar)."""
 OF_THE_MAP = ("frame", "unit", "swap")
 """Kinds of findings that a map's mistake would bring into all pieces."""
 

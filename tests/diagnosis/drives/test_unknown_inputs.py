@@ -51,3 +51,13 @@ def test_nothing_acts_at_amounts_of_zero():
     force, moment = pushed([0.0, 0.3], [0.0, 0.2])
     np.testing.assert_array_equal(force, [10.0, 10.0])
     np.testing.assert_array_equal(moment, [-2.0, -2.0])
+
+
+@pytest.mark.parametrize("label", ["wheel_shear: longitudinal force", "wheel_shear: driving moment"])
+def test_a_wheel_has_no_front(label: str):
+    """What an input adds to a wheel that rolls back is the mirror image of what it adds to one that rolls ahead."""
+    assert "rolling direction" in FOLLOWS[label]
+    for quantity in ("rolling direction", "wheel speed"):
+        force, moment = pushed([0.3, -0.3], [0.2, -0.2], **{amplitude(label, quantity): 0.05})
+        added = (force - 10.0) if "force" in label else (moment + 2.0)
+        assert added[0] != 0.0 and added[1] == pytest.approx(-added[0])

@@ -69,8 +69,8 @@ ASSUMED_MOTOR = 0.5
 """Standard deviation of the logarithm of a torque constant that `convert` assumed: motors of one size
 differ by half."""
 ASSUMED_GEAR = 1.0
-"""The same of a gear that `convert` assumed: those of wheels go from 20 to 250. The torque constant stands for both,
-since currents tell their product alone."""
+"""Standard deviation of the logarithm of a gear ratio that `convert` assumed: gears of wheels go from 20 to 250. The
+torque constant stands for motor and gear, since currents tell their product alone."""
 
 ROVER = (
     _factor("motor", "torque_constant", 0.05, 1e-3, 1.0, "N m/A"),
@@ -239,7 +239,7 @@ def data_sheet(model: Model, logs: Sequence[Log] = ()) -> tuple[Unknown, ...]:
     """
     size = sizes(model)
     found = {u.key: _of_rover(u, size) for u in (*ROVER, *SENSORS)}
-    assumed = [note for note in model.rover.notes if note.startswith("drive: assumed")]
+    assumed = [note for note in model.rover.assumed if note.startswith("drive")]
     spread = math.hypot(
         *(std for what, std in (("motor", ASSUMED_MOTOR), ("gear", ASSUMED_GEAR)) if any(what in n for n in assumed))
     )
