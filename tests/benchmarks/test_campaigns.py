@@ -60,3 +60,21 @@ def test_a_chassis_as_built_is_a_body(rover: str) -> None:
 def test_processes_share_the_cores() -> None:
     assert campaigns.core_shares(range(2, 8), 3) == [{2, 3}, {4, 5}, {6, 7}]
     assert campaigns.core_shares([0, 1], 3) == [{0}, {1}, {0}]
+
+
+def test_processes_take_gpus_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import queue
+
+    monkeypatch.setattr(campaigns.os, "sched_setaffinity", lambda *_: None)
+    monkeypatch.setattr(campaigns.os, "environ", {})
+    for name in ("folder", "until", "limit_s", "settings"):
+        monkeypatch.setattr(campaigns._Process, name, getattr(campaigns._Process, name))
+    places: queue.Queue = queue.Queue()
+    for place in campaigns.places([{0}, {1}, {2}], 2):
+        places.put(place)
+    seen = []
+    for _ in range(3):
+        campaigns._begin(places, tmp_path, 0.0, 0.0, {})
+        seen.append(campaigns.os.environ["CUDA_VISIBLE_DEVICES"])
+    assert seen == ["0", "1", "0"]
+    assert {gpu for _, gpu in campaigns.places([{0}, {1}], 0)} == {None}

@@ -2,10 +2,10 @@
 
     python -m benchmarks.foreign drives --set report --drives 24 --minutes 9 -o build/foreign/report_drives
 
-One process per core takes campaign after campaign: it draws the world, drives it in plain MuJoCo, asks the tool by its
-own verbs, and hands back one row. Rows lie in `rows.jsonl` and whole verdicts in `verdicts.jsonl`, one a line, so that
-what a machine that is taken away had answered is kept; a second call goes on. Before, every process compiles a part of
-the programs of one rover into the cache that all share.
+One process per core, or several for each GPU, takes campaign after campaign: it draws the world, drives it in plain
+MuJoCo, asks the tool by its own verbs, and hands back one row. Rows lie in `rows.jsonl` and whole verdicts in
+`verdicts.jsonl`, one a line, so that what a machine that is taken away had answered is kept; a second call goes on.
+Before, every process compiles a part of the programs of one rover into the cache that all share.
 """
 
 from __future__ import annotations
@@ -211,12 +211,12 @@ def drives(args: argparse.Namespace) -> None:
     have = {r["case"] for r in rows}
     todo = [j for j in jobs(args.set, int(about["seed"]), args.drives) if _name(j) not in have]
     head, dirty = work.commit()
-    places = multiprocessing.get_context("spawn").Queue()
+    queue = multiprocessing.get_context("spawn").Queue()
     allowed = sorted(os.sched_getaffinity(0))
-    for cores in core_shares(allowed, args.processes):
-        places.put(cores)
+    for place in places(core_shares(allowed, args.processes), args.gpus):
+        queue.put(place)
     settings = dict(s.split("=", 1) for s in args.setting)
-    processes = pool.Pool(args.processes, _begin, places, folder, until, args.limit, settings)
+    processes = pool.Pool(args.processes, _begin, queue, folder, until, args.limit, settings)
     try:
         first = {j[5]: j for j in reversed(todo)}  # of every rover
         if not args.cold:
@@ -248,6 +248,11 @@ def core_shares(cores: Sequence[int], processes: int) -> list[set[int]]:
     return [{cores[(k * each + i) % len(cores)] for i in range(each)} for k in range(processes)]
 
 
+def places(shares: Sequence[set[int]], gpus: int) -> list[tuple[set[int], str | None]]:
+    """Cores and GPU of each process, by the cores of each: GPUs in turn, or none where there are 0."""
+    return [(cores, str(k % gpus) if gpus else None) for k, cores in enumerate(shares)]
+
+
 def _report(answers: Iterable[tuple[Any, Any]], begun: float) -> None:
     """Prints what failed of jobs that prepare others."""
     for job, answer in answers:
@@ -262,9 +267,13 @@ class _Process:
     until = limit_s = 0.0
 
 
-def _begin(places: Any, folder: Path, until: float, limit_s: float, settings: Mapping[str, str]) -> None:
+def _begin(queue: Any, folder: Path, until: float, limit_s: float, settings: Mapping[str, str]) -> None:
     # Cores are counted by what a process may use: its own share, so that none makes threads for all.
-    os.sched_setaffinity(0, places.get())
+    cores, gpu = queue.get()
+    os.sched_setaffinity(0, cores)
+    if gpu is not None:
+        # before JAX is imported, which else takes the first GPU, and three quarters of its memory
+        os.environ |= {"CUDA_VISIBLE_DEVICES": gpu, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     _Process.folder, _Process.until, _Process.limit_s, _Process.settings = folder, until, limit_s, settings
 
 
