@@ -154,7 +154,12 @@ def _reference(m: Motion, bulldozing: bool = True) -> dict[str, float]:
         length = r * np.sin(theta_1)
         # the circle's height over the chord, by the parabola through its ends
         side = quad(lambda x: wall(m.sinkage * (1 - (x / length) ** 2)), 0.0, length)[0]
-        moved = m.v_y / omega * theta_1 / 2 / SOIL["K"]
+        # the way aside at the centroid of the buried side, for a braked wheel as its shear has it
+        centroid = (
+            quad(lambda x: x * (1 - (x / length) ** 2), 0.0, length)[0]
+            / quad(lambda x: 1 - (x / length) ** 2, 0.0, length)[0]
+        )
+        moved = (length - centroid) * m.v_y / min(m.rim, m.v_x) / SOIL["K"]
         out["across"] -= side * np.sign(moved) * (1 - np.exp(-abs(moved)))
     out["turn"] -= 0.05 * r * out["up"] * np.tanh(m.rim / 0.01)
     return out

@@ -124,7 +124,7 @@ def earth_pressure(c: Context, weight: float, depth: np.ndarray, squared: np.nda
 
 
 def bulldozing(c: Context, p: SimpleNamespace) -> None:
-    """Soil pushed ahead, as far as the wheel travels more than it turns free, and beside, as the shear is mobilised."""
+    """Soil pushed ahead, as far as the wheel travels more than it turns free, and beside, by its flank's way aside."""
     sinkage, r = below_surface(c), c.geometry["radius"]
     soft = (sinkage > 0.0) & (c.soil["rock"] <= 0.5)
     weight = p.density * c.gravity
@@ -134,7 +134,10 @@ def bulldozing(c: Context, p: SimpleNamespace) -> None:
     front = -p.front * soft * c.geometry["width"] * earth_pressure(c, weight, sinkage, sinkage * sinkage) * ahead
     theta_1 = c.normal["entrance"]
     length = r * np.sin(np.minimum(theta_1, 0.5 * np.pi))
-    moved = mobilised(r * (theta_1 - c.normal["theta_m"]) * c.slip["slip_y"], c.soil["shear_modulus_y"])
+    v_x, still = c.contact["v_x"], 2e-3
+    fastest = np.maximum(np.abs(c.contact["rim_speed"]), np.abs(v_x))
+    aside = c.slip["slip_y"] * np.hypot(fastest, still) / np.hypot(v_x, still)
+    moved = mobilised(0.625 * length * aside, p.build_up * c.soil["shear_modulus_y"])
     # Along the wheel's front the depth falls as a parabola, 1 - u^2: 2/3 is its mean, 8/15 that of its square.
     wall = earth_pressure(c, weight, sinkage * (2.0 / 3.0), sinkage * sinkage * (8.0 / 15.0))
     side = -p.side * soft * length * wall * moved

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 
 from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.wheel.closed_form import contact_with_soil, grounded, janosi
 from lunar_mjx.spatial import Vec3
+
+_STILL: Annotated[float, "m/s"] = 2e-3
+"""m/s; below it a wheel counts as standing, as for the slip ratio."""
 
 
 def passive_pressure(soil, weight, depth, depth_squared):
@@ -47,6 +51,14 @@ BULK_DENSITY = Parameter(
     side=Parameter(
         1.0, 0.0, (0.0, 10.0), "1", "share of the bulldozing resistance beside the wheel", "Ishigami et al. 2007: 1"
     ),
+    build_up=Parameter(
+        1.0,
+        None,
+        (0.01, 50.0),
+        "1",
+        "sideways way over K_y at which 63 % of the pressure beside the wheel have built up",
+        "choice: as the shear; Ishigami et al. 2007 have all of it at once (0)",
+    ),
     density=BULK_DENSITY,
 )
 def bulldozing(ctx, p, x, wheel):
@@ -54,8 +66,9 @@ def bulldozing(ctx, p, x, wheel):
 
     D_1 = cot X_c + tan(X_c + phi), D_2 = cot X_c + cot^2 X_c tan phi, X_c = 45 deg - phi/2 (Ishigami et al. 2007; Wong
     2008 for the front). In front h is the sinkage, over the wheel's width, in proportion to the travel per rolling; a
-    wheel that spins on the spot pushes none. On the side h follows the circle from the sinkage to zero over r sin
-    theta_1 (means of h and h^2: 2/3 z, 8/15 z^2), and is mobilised by the lateral shear displacement as is the shear.
+    wheel that spins on the spot pushes none. On the side h follows the circle from the sinkage to zero over l = r sin
+    theta_1 (means of h and h^2: 2/3 z, 8/15 z^2). Its pressure builds up with the way that the flank has made aside at
+    its centroid, 5/8 l v_y/v_x: soil beside a wheel passes at v_x, however fast the wheel turns.
     """
     contact, geometry, normal, soil = contact_with_soil(ctx), ctx.geometry, ctx.normal, ctx.soil
     z, r = contact.sinkage, geometry.radius
@@ -67,9 +80,11 @@ def bulldozing(ctx, p, x, wheel):
     ahead = jnp.clip(jnp.where(opposed, 0.5, 1.0) * (wheel.direction - wheel.slip_x), -1.0, 1.0)
     front = -p.front * soft * geometry.width * passive_pressure(soil, weight, z, z * z) * ahead
     length = r * jnp.sin(jnp.minimum(normal.entrance, 0.5 * jnp.pi))
-    # Mobilised as shear is: a wall that has not moved yet meets no passive pressure (Janosi's curve stands for the
-    # way).
-    moved = janosi(r * (normal.entrance - normal.theta_m) * wheel.slip_y, soil.shear_modulus_y)
+    # A wall that has not moved yet meets no passive pressure (Janosi's curve stands for the way).
+    # The displacement of the shear refers to the faster of rim and travel, and is kept at rest, where v_y/v_x is lost.
+    fastest = jnp.maximum(jnp.abs(contact.rim_speed), jnp.abs(contact.v_x))
+    passed = jnp.sqrt((fastest**2 + _STILL**2) / (contact.v_x**2 + _STILL**2))
+    moved = janosi(0.625 * length * passed * wheel.slip_y, p.build_up * soil.shear_modulus_y)
     wall = passive_pressure(soil, weight, 2.0 / 3.0 * z, 8.0 / 15.0 * z * z)
     side = -p.side * soft * length * wall * moved
     # the side force acts at the rim's depth, and at the centroid of the buried side, 3/8 of its length ahead
