@@ -14,6 +14,8 @@ class TableSettings(SearchSettings):
     """Sizes, priors and effort of a diagnosis of tables; written to `run.json`."""
 
     # --- what is usual -----------------------------------------------------------------------------------------------
+    effect_discrepancy: float = 0.2
+    """1; scale of the half-normal prior of what the law of an effect gets wrong, over what the effect does."""
     following_discrepancy: float = 0.2
     """1; standard deviation of something unlisted that follows one quantity alone."""
     added_force: float = 0.25

@@ -10,11 +10,13 @@ import jax
 import numpy as np
 from scipy import linalg
 
+from lunar_mjx.diagnosis.contact_laws import LAWS
 from lunar_mjx.diagnosis.tables.noise import scatter
 from lunar_mjx.diagnosis.tables.port_gains import ADDED, DRAWN, FIELDS, GAINS, Gain
 from lunar_mjx.diagnosis.tables.settings import TableSettings
 from lunar_mjx.diagnosis.tables.wheel_program import ABSCISSAE, Imposed, WheelProgram
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm
+from lunar_mjx.effects.presets import PRESETS
 from lunar_mjx.inference.bounded_descent import minimise
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.evidence import Amplitudes, EvidenceError, Field, Gram, NoiseSize
@@ -174,6 +176,7 @@ class WheelForm(MeasuredForm):
         self.observations, self.words = data.observations, FIELDS
         self.shares = {f: max(self._share(g) for g in GAINS if g.field == f) for f in FIELDS}
         self._fit = data.observations.in_split("fit")
+        self._amounts = _amounts(bed, coordinates)
         names = _instruments(data)
         self.instruments = names
         rare = settings
@@ -220,21 +223,29 @@ class WheelForm(MeasuredForm):
         fields, field_of = self._fields(gains, False)
         added, added_to = self._fields(gains, True)
         unlisted, followed = self._following(gains)
-        columns = np.column_stack([own, whiten(errors), fields, added, unlisted])
+        rough, inexact = self._inexact(slope, u)
+        columns = np.column_stack([own, whiten(errors), fields, added, unlisted, rough])
         calibrated = count + np.arange(errors.shape[1])
         field_columns = count + errors.shape[1] + np.arange(fields.shape[1])
-        last = columns.shape[1] - unlisted.shape[1]
+        end = columns.shape[1] - rough.shape[1]
+        last = end - unlisted.shape[1]
         more = last - added.shape[1]
         # no field's size is inferred for these (field -1): what follows speed or load is asked for, and never usual
         sizes = np.full(unlisted.shape[1], settings.following_discrepancy)
         std = np.concatenate(
-            [[c.prior for c in self.coordinates], error_std, np.ones(last - more + len(field_columns)), sizes]
+            [
+                [c.prior for c in self.coordinates],
+                error_std,
+                np.ones(last - more + len(field_columns)),
+                sizes,
+                np.ones(rough.shape[1]),
+            ]
         )
         for places in self.candidates.values():
             amplitude = [i for i in places if self.coordinates[i].amplitude]
             std[amplitude] = [self.effect_size(self.coordinates[i]) for i in amplitude]
         none = np.full(count + errors.shape[1], -1)
-        field = np.concatenate([none, field_of, added_to, np.full(unlisted.shape[1], -1)])
+        field = np.concatenate([none, field_of, added_to, np.full(unlisted.shape[1] + rough.shape[1], -1)])
         mean = np.zeros(len(std))
         centre = np.array([c.centre for c in self.coordinates])
         mean[:count] = centre - u
@@ -276,6 +287,8 @@ class WheelForm(MeasuredForm):
             far=settings.bad_calibration,
             amount=self.amounts(len(std)),
             freedom=settings.effect_freedom,
+            inexact={name: end + places for name, places in inexact.items()},
+            inexactness=settings.effect_discrepancy,
         )
         return linear, columns, residual
 
@@ -317,6 +330,29 @@ class WheelForm(MeasuredForm):
             columns.append(left[:, keep] * size[keep])
             number.append(np.full(int(keep.sum()), f))
         return np.column_stack(columns), np.concatenate(number)
+
+    def _inexact(self, slope: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Whitened columns (n, m) of what the laws of the effects that act may get wrong, and places by effect.
+
+        The law of an effect is no more exact than that of a contact: what it does is multiplied by a smooth function of
+        the table's points. Else a second effect would be named for what the law of the first one gets wrong.
+        """
+        columns, places, at = [np.zeros((len(slope), 0))], {}, 0
+        size = self.settings.effect_discrepancy
+        for name, amounts in self._amounts.items() if size > 0.0 else ():
+            # in scales of each amplitude, from where the effect vanishes
+            acts = {i: u[i] + self.coordinates[i].start / self.coordinates[i].scale - null for i, null in amounts}
+            acting = [slope[:, [i]] * amount for i, amount in acts.items() if amount != 0.0]
+            if not acting:
+                continue
+            modes = self.data.modes[self.data.point]
+            white = self.data.observations.whiten(np.column_stack([one * modes for one in acting]))
+            left, length, _ = np.linalg.svd(white, full_matrices=False)
+            keep = length * size > self.settings.least_length
+            columns.append(left[:, keep] * length[keep])
+            places[name] = at + np.arange(int(keep.sum()))
+            at += int(keep.sum())
+        return np.column_stack(columns), {n: p for n, p in places.items() if len(p)}
 
     def _following(self, slope: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Whitened columns (n, m) of unlisted inputs that follow one quantity alone, and places by a term's name."""
@@ -384,15 +420,15 @@ class WheelForm(MeasuredForm):
         u[free] = np.clip(u[free], *(self._bounds(free) + np.array([[1e-9], [-1e-9]])))
         terms = frozenset(t for t in self.terms if t.kind == EFFECT and t.name in effects)
         linear, columns, _ = self.linearise(u)
-        value, inferred, _ = linear.evidence(terms)
+        value, inferred, places = linear.evidence(terms)
         best = None
         for _ in range(settings.most_rounds):
-            scale = linear.amplitudes.std * np.append(inferred.tau, 1.0)[linear.amplitudes.field]
-            shared = linear.always[linear.always >= len(u)]  # calibration and fields of usual size
-            spread = columns[self._fit][:, shared] * scale[shared], inferred.noise[self.noise_group()[self._fit]]
+            prior, shared = inferred.amplitudes, places >= len(u)  # calibration, discrepancy, laws of effects
+            scale = prior.std * np.append(inferred.tau, 1.0)[prior.field]
+            spread = columns[self._fit][:, places[shared]] * scale[shared], self._noise(inferred.noise)
             u = self._descend(u, free, linear, spread)
             linear, columns, _ = self.linearise(u)
-            value, inferred, _ = linear.evidence(terms, (inferred.tau, inferred.noise))
+            value, inferred, places = linear.evidence(terms, (inferred.tau, inferred.noise))
             gained = np.inf if best is None else value - best[0]
             if gained > 0.0:
                 best = value, Refit(self.name, effects, u, linear)
@@ -401,6 +437,10 @@ class WheelForm(MeasuredForm):
                 break
         assert best is not None
         return best[1]
+
+    def _noise(self, factors: np.ndarray) -> np.ndarray:
+        """(fitted,) factors on the noise of those of its groups."""
+        return factors[self.noise_group()[self._fit]]
 
     def alone(self, refit: Refit) -> np.ndarray:
         """(coordinates,) where the model alone predicts best: least squares under the noise, begun at the refit."""
@@ -451,6 +491,18 @@ class WheelForm(MeasuredForm):
         # A sum of squares is twice a log density, in which the threshold is given.
         out[free] = minimise(at, u[free], low, high, 2.0 * self.settings.fit_settled, self.settings.most_evaluations)
         return out
+
+
+def _amounts(bed: WheelBed, coordinates: Sequence[Coordinate]) -> dict[str, list[tuple[int, float]]]:
+    """Places of the amplitudes of all effects beyond the contact laws, and their nulls in scales, by effect."""
+    own = {*PRESETS["consistent"], *(part for parts in LAWS.values() for part in parts)}
+    by_name = {e.name: e for e in bed.effects if e.name not in own}
+    found: dict[str, list[tuple[int, float]]] = {}
+    for i, c in enumerate(coordinates):
+        null = by_name[c.effect].parameters[c.name].null if c.effect in by_name else None
+        if null is not None and not c.log:
+            found.setdefault(c.effect, []).append((i, null / c.scale))
+    return found
 
 
 def _instrument(abscissa: str) -> str:

@@ -69,6 +69,8 @@ class Linear:
         where None. freedom: of Student's t prior of an effect's amplitudes; they are Gaussian where it is 0.
       unkept: nats that the derivatives promise beyond the refit and that its descent could not reach: no hypothesis
         around it is credited with them.
+      inexact: columns of what the laws of effects get wrong, by effect; those of `effects` belong to hypotheses with
+        that effect, those of the model's own to all. inexactness: scale of the half-normal prior of their size.
     """
 
     gram: Gram
@@ -90,6 +92,8 @@ class Linear:
     amount: np.ndarray | None = None
     freedom: float = 0.0
     unkept: float = 0.0
+    inexact: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    inexactness: float = 0.0
 
     def evidence(
         self, terms: frozenset[Term], start: tuple[np.ndarray, np.ndarray] | None = None
@@ -110,10 +114,11 @@ class Linear:
         gram, prior, fields, places, back = self._model(terms)
         given = len(self.fields)
         if start is not None:
-            start = np.append(start[0], np.ones(len(fields) - given)), start[1]
+            start = np.append(start[0], [f.usual for f in fields[given:]]), start[1]
         inferred = infer(gram, prior, fields, self.noises, start)
         if len(fields) > given:
-            # Sizes of effects belong to this hypothesis alone: for whoever reads on they are part of the prior.
+            # Sizes of effects, and of what their laws get wrong, belong to this hypothesis alone: for whoever reads on
+            # they are part of the prior.
             effect, std = prior.field >= given, prior.std.copy()
             std[effect] *= inferred.tau[prior.field[effect]]
             inferred = dataclasses.replace(
@@ -135,9 +140,9 @@ class Linear:
         ten times as long. Minus infinity where rounding spoils it.
         """
         gram, prior, fields, *_ = self._model(terms)
-        more = len(fields) - len(self.fields)
+        usual = np.array([f.usual for f in fields[len(self.fields) :]])
         # of a few sizes of its effects the best: for a choice among sets that will do
-        tried = [np.append(sizes[0], np.full(more, size)) for size in (_SIZES if more else _SIZES[:1])]
+        tried = [np.append(sizes[0], size * usual) for size in (_SIZES if len(usual) else _SIZES[:1])]
         try:
             return max(log_density(gram, prior, tau, sizes[1]) for tau in tried)
         except EvidenceError:
@@ -151,6 +156,8 @@ class Linear:
         own = [self.effects[name] for name in self.effects if name in named]
         unlisted = {t.name for t in terms if t.kind == UNLISTED}
         own += [part[name] for part in (self.added, self.following) for name in part if name in unlisted]
+        rough = [p for name, p in self.inexact.items() if name in named or name not in self.effects]
+        own += rough
         places = np.concatenate([self.always, *own]).astype(int)
         # An effect of the refit that is no term of this hypothesis goes back to its null.
         gone = [p for name, p in self.effects.items() if name not in named and np.any(self.at[p] != 0.0)]
@@ -168,6 +175,11 @@ class Linear:
         # an instrument that errs more than usual has the columns of every hypothesis, with a wider prior
         prior = Amplitudes(std, self.amplitudes.field, self.amplitudes.mean).select(places)
         fields = [Field(f.name, self.wide) if f.name in unlisted else f for f in self.fields]
+        if rough:
+            field = prior.field.copy()
+            field[np.isin(places, np.concatenate(rough))] = len(fields)
+            prior = Amplitudes(prior.std, field, prior.mean)
+            fields.append(Field("laws of effects", self.inexactness))
         if self.freedom > 0.0 and self.amount is not None:
             # What is nominal is a guess: an amplitude ten times as large is rare, and no miracle (Jeffreys 1961).
             by_column = np.full(self.gram.width, -1)

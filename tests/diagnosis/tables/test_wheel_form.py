@@ -220,6 +220,51 @@ def test_an_effect_is_named_and_what_remains_is_told_by_port(folder):
     assert (found.best.evidence.tau < 0.1).all()
 
 
+def test_the_law_of_an_effect_is_inexact_where_it_acts(folder):
+    form = tables(folder, "plain").own
+    u = np.zeros(len(form.coordinates))
+    assert not form.linearise(u)[0].inexact
+    place = next(i for i, c in enumerate(form.coordinates) if c.key == "rolling_resistance.coefficient")
+    u[place] = 1.0
+    linear, columns, _ = form.linearise(u)
+    (own,) = linear.inexact.values()
+    named = form.listed(frozenset({"rolling_resistance"}))
+    assert set(own) <= set(linear.evidence(named)[2])
+    # neither where it is not, nor beside another alone
+    for others in (frozenset(), form.listed(frozenset({"slip_sinkage"}))):
+        assert not set(own) & set(linear.evidence(others)[2])
+    # a couple about the axle can be wrong in the driving torque alone
+    torque = form.data.quantity == 2
+    assert np.abs(columns[torque][:, own]).max() > 0.0
+    np.testing.assert_allclose(columns[~torque][:, own], 0.0, atol=1e-9)
+
+
+def test_the_law_of_an_effect_that_was_added_is_inexact_too(folder):
+    model = make_model("luvmi_x", terrain="flat", preset="consistent").add("rolling_resistance", coefficient=0.05)
+    tables(folder, "plain")
+    run = Run(folder / "run", (folder / "plain",), model)
+    form = build_tables(run, run.campaign(), rivals=False).own
+    linear, _, _ = form.linearise(np.zeros(len(form.coordinates)))
+    assert set(linear.inexact) == {"rolling_resistance"}
+    assert set(linear.inexact["rolling_resistance"]) <= set(linear.evidence(frozenset())[2])
+
+
+def test_what_the_law_of_an_effect_gets_wrong_speaks_for_no_second_one(folder, monkeypatch):
+    def resist(frame):
+        # half as strong at the strongest slip
+        share = 1.0 - 0.5 * (frame["slip_ratio"] + 0.1) / 0.7
+        return frame.assign(
+            driving_torque_Nm=frame["driving_torque_Nm"] + 0.25 * share * RADIUS * frame["normal_load_N"]
+        )
+
+    form = tables(folder, "uneven", change=resist, seed=6).own
+    named = form.listed(frozenset({"rolling_resistance"}))
+    value = form.refit(frozenset({"rolling_resistance"}), None, None).linear.evidence(named)[0]
+    monkeypatch.setattr(form, "settings", dataclasses.replace(form.settings, effect_discrepancy=0.0))
+    exact = form.refit(frozenset({"rolling_resistance"}), None, None).linear.evidence(named)[0]
+    assert value > exact + 1.0
+
+
 def test_rival_laws_take_the_place_of_the_models_own():
     model = make_model("luvmi_x", terrain="flat", preset="consistent")
     laws = contact_laws(model, TableSettings().laws)
