@@ -278,6 +278,7 @@ def simulate(
     dropouts: Annotated[float, typer.Option(help="Share of samples lost.")] = 0.0,
     bias: Annotated[list[str] | None, typer.Option(help="Constant added to a channel, as gyro_z_rad_s=0.01.")] = None,
     forces: Annotated[bool, typer.Option(help="With force and torque sensors.")] = False,
+    bus_current: Annotated[bool, typer.Option(help="With the current of all motors together.")] = False,
     seconds: Annotated[float | None, typer.Option(help="Length of the drive; the manoeuvre's own if left out.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=MOST_SEED, help="Of the noise; drawn if left out.")] = None,
     split: Annotated[str | None, typer.Option(help="fit, select or test.")] = None,
@@ -290,7 +291,13 @@ def simulate(
     from lunar_mjx.model.file import load_model
 
     recording = Recording(
-        parse_noise(noise), coloured, quantise=quantise, dropouts=dropouts, bias=_numbers("--bias", bias), forces=forces
+        parse_noise(noise),
+        coloured,
+        quantise=quantise,
+        dropouts=dropouts,
+        bias=_numbers("--bias", bias),
+        forces=forces,
+        bus_current=bus_current,
     )
     hidden = [_effect(text) for text in effect or []] + [(text, {}) for text in effects or []]
     folder = simulate_log(

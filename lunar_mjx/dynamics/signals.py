@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from lunar_mjx.dynamics.bus import BUS_CURRENT, BUS_VOLTAGE, bus_current
 from lunar_mjx.dynamics.quaternions import rotation
 from lunar_mjx.dynamics.state import Params, Telemetry
 from lunar_mjx.effects.base import Effect
@@ -92,6 +93,7 @@ def observe(
     params: Params | None = None,
     imu_position: Sequence[float] | None = None,
     imu_quaternion: Sequence[float] | None = None,
+    bus_voltage: Any = None,
 ) -> Signals:
     """The true channels of a drive: what perfect sensors with one clock would write.
 
@@ -106,11 +108,14 @@ def observe(
       imu_position: of the accelerometer in the chassis frame, m; the frame's origin if None.
       imu_quaternion: w, x, y, z from the IMU's axes to the chassis's, for the channels of gyroscope and accelerometer;
         the same axes if None.
+      bus_voltage: by which the current of the bus is told, V, a number or (time,); the model's own if None. Where
+        neither is known there is no channel bus_current_A.
 
     Returns:
       Channels of shape (time,) or (batch, time), named as in a log.
     """
-    gravity = _felt_gravity(system.model.effects, system.params if params is None else params)
+    params = system.params if params is None else params
+    gravity = _felt_gravity(system.model.effects, params)
     gravity = gravity[..., None] if gravity.ndim else gravity
     corners = [w.corner for w in system.model.rover.wheels]
     seen = telemetry
@@ -155,10 +160,13 @@ def observe(
             "bus_load_W": supply.load,
             "bus_solar_W": supply.solar,
             "battery_charge_ratio": supply.charge,
-            "bus_voltage_V": supply.voltage,
+            BUS_VOLTAGE: supply.voltage,
             "chassis_temperature_degC": None if kelvin is None else kelvin - ZERO_CELSIUS,
         }
         out |= {name: value for name, value in other_channels.items() if value is not None}
+    drawn = bus_current(seen, params, bus_voltage)
+    if drawn is not None:
+        out[BUS_CURRENT] = drawn
     return Signals(jnp.asarray(seen.time), {k: jnp.asarray(v) for k, v in out.items()})
 
 
@@ -248,9 +256,10 @@ def measure(
     params: Params | None = None,
     imu_position: Sequence[float] | None = None,
     imu_quaternion: Sequence[float] | None = None,
+    bus_voltage: Any = None,
 ) -> Signals:
     """What the rover's sensors write: `observe` with its arguments, and then the effects at the port `sensor`."""
-    signals = observe(system, telemetry, params, imu_position, imu_quaternion)
+    signals = observe(system, telemetry, params, imu_position, imu_quaternion, bus_voltage)
     used = system.params if params is None else params
     return apply_sensors(system.model.effects, used, signals, sensor_context(system, signals, params))
 

@@ -102,6 +102,7 @@ CHANNELS: tuple[Channel, ...] = (
     _channel("motor_{c}_{j}_current", "A", "electrical", -200.0, 200.0, _ELECTRIC),
     _channel("motor_{c}_{j}_voltage", "V", "electrical", -2e3, 2e3, "beyond any rover's bus, simulated or not"),
     _channel("bus_voltage", "V", "electrical", 0.0, 400.0, _ELECTRIC),
+    _channel("bus_current", "A", "electrical", -400.0, 400.0, "ten motors of 40 A; more looks like mA"),
     _channel("bus_load", "W", "electrical", -1e5, 1e5, "200 V at 200 A, braking motors included, and some more"),
     _channel("bus_solar", "W", "electrical", -1.0, 1e5, "70 m2 of panels in full sunlight at 1 au"),
     _channel("battery_charge", "ratio", "electrical", -0.1, 1.1, "a share of the full charge"),

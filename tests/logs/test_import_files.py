@@ -308,6 +308,20 @@ def test_cut_at_gaps_and_rests_and_nothing_is_lost(tmp_path: Path) -> None:
         assert all(log.tables["drive"].time_s[0] == 0.0 for log in logs)
 
 
+def test_the_current_of_the_bus_comes_in_the_logger_s_units(tmp_path: Path) -> None:
+    t = 0.1 * np.arange(20)
+    pd.DataFrame({"t": t, "i": 1500.0 + t, "v": 28.5 - t}).to_csv(tmp_path / "a.csv", index=False)
+    text = '[log]\nrover = "husky"\n[tables.drive]\nfile = "a.csv"\ntime = "t"\n[tables.drive.channels]\n'
+    text += 'bus_current_mA = "i"\nbus_voltage_mV = { column = "v", scale = 1000.0 }\n'
+    found = import_drives(tmp_path / "a.csv", tmp_path / "log", write_map(tmp_path, text))
+    log = drive(found.folder)
+    np.testing.assert_allclose(log.channel("bus_current_A")[1], 1.5 + 1e-3 * t)
+    np.testing.assert_allclose(log.channel("bus_voltage_V")[1], 28.5 - t)
+    for name, words in (("bus_current", "does not say its unit"), ("bus_current_V", "does not convert to A")):
+        with pytest.raises(UserError, match=words):
+            read_map(write_map(tmp_path, text.replace("bus_current_mA", name)))
+
+
 @pytest.mark.parametrize("imposed", [True, False])
 def test_other_units_lose_nothing_that_the_map_states(imposed: bool, tmp_path: Path) -> None:
     """Speeds in rpm are imposed and tell rests, and currents in mA are magnitudes, as those in SI units are."""
@@ -399,7 +413,7 @@ def test_a_rover_beside_its_map_is_found_from_anywhere(tmp_path: Path, monkeypat
             "state one over the wheel's radius in m, as in joint_left_drive_speed_rad_s = {",
         ),
         ("accelerometer_x_g", "state the factor between the units, as in accelerometer_x_m_s2 = {"),
-        ("bus_current_A", "is no channel; list the names with lunar-mjx log channels"),
+        ("battery_current_A", "is no channel; list the names with lunar-mjx log channels"),
     ],
 )
 def test_a_unit_that_does_not_convert_is_told_with_the_remedy(channel: str, words: str, tmp_path: Path) -> None:

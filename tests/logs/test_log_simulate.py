@@ -45,7 +45,7 @@ def fast(clean: Log, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_simulated_log_is_what_its_model_commands_and_does(clean: Log) -> None:
     assert {n: t.rate_hz for n, t in clean.tables.items()} == RATES
-    assert check(clean) == [] and clean.noise == {}
+    assert check(clean) == [] and clean.noise == {} and "bus_current_A" not in clean.channel_names
     base = make_model("luvmi_x", "flat")
     model = log_model(clean, base)
     plan = load_manoeuvre("speed_staircase")

@@ -84,6 +84,12 @@ def _limited(voltage, limit):
     return voltage + voltage * jnp.expm1(-jnp.log1p(excess) / SHARPNESS)
 
 
+def sagged_voltage(p: Any, power: Any) -> Any:
+    """Voltage, V, of a bus with the parameters of `bus_droop` under the power of its motors, W."""
+    # By V_0 and not by the sagged voltage: the equation in V would be quadratic, for a change of second order.
+    return p.voltage - p.resistance * power / p.voltage
+
+
 @effect(
     "sensor",
     order=-10,
@@ -102,6 +108,4 @@ def bus_droop(ctx, p, x, signals):
     power = 0.0
     for joint in ctx.joints:
         power = power + signals.channels[f"motor_{joint}_voltage_V"] * signals.channels[f"motor_{joint}_current_A"]
-    # By V_0 and not by the sagged voltage: the equation in V would be quadratic, for a change of second order.
-    bus = p.voltage - p.resistance * power / p.voltage
-    return signals.with_channels({"bus_voltage_V": bus + jnp.zeros_like(signals.time)})
+    return signals.with_channels({"bus_voltage_V": sagged_voltage(p, power) + jnp.zeros_like(signals.time)})

@@ -57,6 +57,10 @@ FORCE_SENSORS: tuple[Instrument, ...] = (
 """On test vehicles; written with `forces=True`."""
 
 
+BUS_SENSOR = Instrument("bus_current_A", "drive", 0.05, 0.025, "shunt amplifier of 12 bits over 100 A")
+"""Reads all motors together; written with `bus_current=True`, since most rovers read a current per motor instead."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Recording:
     """How a simulated log is recorded.
@@ -69,6 +73,7 @@ class Recording:
       dropouts: share of samples lost, half as rows and half as cells.
       bias: constant added to a channel, by name.
       forces: with force and torque sensors.
+      bus_current: with the current that the bus gives to all motors.
     """
 
     scale: float = 1.0
@@ -78,6 +83,7 @@ class Recording:
     dropouts: float = 0.0
     bias: Mapping[str, float] = dataclasses.field(default_factory=dict)
     forces: bool = False
+    bus_current: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 <= require_finite("log simulate", "noise scale", self.scale) <= 1e3:
@@ -90,8 +96,8 @@ class Recording:
 
     @property
     def instruments(self) -> tuple[Instrument, ...]:
-        """The sensors aboard; those of wheel forces, which few rovers have, where they are asked for."""
-        return INSTRUMENTS + (FORCE_SENSORS if self.forces else ())
+        """The sensors aboard; those of wheel forces and of the whole current where they are asked for."""
+        return INSTRUMENTS + (FORCE_SENSORS if self.forces else ()) + ((BUS_SENSOR,) if self.bus_current else ())
 
     def noise(self, channels: list[str]) -> dict[str, Noise]:
         """What `log.toml` states: total noise by channel, from the datasheet; it does not tell its colour."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lunar_mjx.dynamics import bus
 from lunar_mjx.dynamics.signals import measure, observe
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.joint.electrical import BUS_VOLTAGE
@@ -37,8 +38,6 @@ class SimulatedDrive:
 
 SIMULATED_DRIVE = SimulatedDrive()
 
-
-BUS = "bus_voltage_V"
 
 Hidden = str | Effect | tuple[str | Effect, Mapping[str, float]]
 """An effect by name, as an object, or either with parameter values; an effect of the model is set instead of added."""
@@ -214,12 +213,13 @@ def _drive(
     system, seen = simulate(model, Commands(np.concatenate([still, fine]), interval), *start, engine=engine)
     # the log's clock begins when the rover stands; what is measured before is left out
     seen = _after(seen, settle, np.asarray(seen.time)[settle])
+    constant = None if bus.tells_bus_voltage(model.effect_names) else BUS_VOLTAGE
     # Which channels a log has must not tell what is hidden: those of every rover, and its bus.
-    names = (*observe(system, seen).channels, BUS)
-    signals = measure(system, seen).channels
+    names = (*observe(system, seen, bus_voltage=constant).channels, bus.BUS_VOLTAGE)
+    signals = measure(system, seen, bus_voltage=constant).channels
     channels = {n: np.asarray(signals[n], float) for n in names if n in signals}
     # A bus that never sags: without the channel its absence would tell that nothing is hidden there.
-    channels.setdefault(BUS, np.full(len(fine), BUS_VOLTAGE))
+    channels.setdefault(bus.BUS_VOLTAGE, np.full(len(fine), BUS_VOLTAGE))
     if not all(np.isfinite(v).all() for v in channels.values()):
         raise UserError("log simulate: an effect at the port sensor gives values that are not finite; mend the effect.")
     time = interval * np.arange(len(fine))
