@@ -286,6 +286,54 @@ def test_a_spoilt_log_is_told(case: str, tmp_path: Path) -> None:
     assert matching[0].to_dict()["line"] == matching[0].line
 
 
+def with_bus(electronics: float, factor: float, *more: Callable[[Tables], object]) -> Callable[[Tables], None]:
+    """Adds what the bus gives, times a factor: the motors' power over 48 V, without jerks, and the electronics."""
+
+    def change(tables: Tables) -> None:
+        drive = tables["drive"]
+        motors = [c for c in drive if c.startswith("motor_") and c.endswith("current_A")]
+        power = sum(drive[c] * drive[c.replace("current_A", "voltage_V")] for c in motors)
+        drive["bus_current_A"] = factor * (np.clip(power / 48.0, -1.5, 1.5) + electronics)
+        for other in more:
+            other(tables)
+
+    return change
+
+
+def downhill(tables: Tables) -> None:
+    drive = tables["drive"]
+    drive["pitch_deg"] += 6.0
+    tilt = np.radians(6.0)
+    drive["accelerometer_x_m_s2"] -= GRAVITY * np.sin(tilt)
+    drive["accelerometer_z_m_s2"] -= GRAVITY * (1.0 - np.cos(tilt))
+
+
+@pytest.mark.parametrize(
+    ("electronics", "factor", "kind", "words"),
+    [
+        (1.5, 1.0, "", ""),
+        (0.0, 1.0, "", ""),
+        (1.5, -1.0, "frame", "negative on the whole (mean -1."),
+        (0.0, -1.0, "frame", "change its sign"),
+        (0.0, 200.0, "unit", "looks like mA"),
+        (1.5, 1000.0, "range", "outside [-400, 400]"),
+    ],
+)
+def test_the_current_of_the_bus(electronics: float, factor: float, kind: str, words: str, tmp_path: Path) -> None:
+    found = [f for f in check(make_log(tmp_path / "a", with_bus(electronics, factor))) if f.column == "bus_current_A"]
+    assert [f.kind for f in found] == ([kind] if kind else []), found
+    assert all(words in f.message and f.severity == "bad_data" for f in found)
+
+
+def test_a_bus_that_is_charged_downhill_or_by_panels_is_no_mistake(tmp_path: Path) -> None:
+    def panels(tables: Tables) -> None:
+        tables["drive"]["bus_solar_W"] = 100.0 + np.random.default_rng(0).standard_normal(len(tables["drive"]))
+
+    for name, more in (("slope", downhill), ("panels", panels)):
+        found = check(make_log(tmp_path / name, with_bus(1.0, -1.0, more)))
+        assert not [f for f in found if f.column == "bus_current_A"], name
+
+
 @pytest.mark.parametrize(("share", "bad"), [(0.35, False), (0.7, True)])
 def test_a_short_table_may_lose_a_few_more_cells_by_chance(share: float, bad: bool, tmp_path: Path) -> None:
     def change(tables: Tables) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from lunar_mjx.effects.body.chassis import payload_refusal
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.logs.checks.bus import check_bus
 from lunar_mjx.logs.checks.clock import check_clock
 from lunar_mjx.logs.checks.frames import check_frames
 from lunar_mjx.logs.checks.motors import check_motors
@@ -134,7 +135,7 @@ def _check_drive(log: Log) -> list[Finding]:
         return findings  # everything below reads channels by their time
     findings = check_values(log)
     bad = {f.column for f in findings if f.severity == "bad_data"}
-    for part in (check_frames, check_motors, check_noise):
+    for part in (check_frames, check_motors, check_bus, check_noise):
         # A column that is broken already would fail every comparison with others; one finding is enough.
         findings += [f for f in part(log) if f.column not in bad]
     return findings
