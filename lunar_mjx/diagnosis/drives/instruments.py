@@ -51,9 +51,11 @@ USUAL_SCALE = {
     "world": 0.01,
     "body": 0.01,
     "wheel": 0.05,
+    "bus A": 0.05,
 }
-"""Usual error of an instrument's scale by the first word of its channels: 1 %, and 5 % of what a camera sees of a rim
-in the soil, whose surface is rough. Angles of joints are counted, and have none."""
+"""Usual error of an instrument's scale by the first word of its channels, or with their unit: 1 %; 5 % of what a camera
+sees of a rim in the soil, whose surface is rough, and of the current of a bus, of which amplifiers lose 2 to 10 %.
+Angles of joints are counted, and have none."""
 _VECTORS = {"gyro": "gyro_{}_rad_s", "accelerometer": "accelerometer_{}_m_s2"}
 
 
@@ -162,13 +164,14 @@ def usual_errors(observations: Observations, predicted: np.ndarray, rate: np.nda
         word, part = sensor_of(s.channel), slice(s.start, s.stop)
         if word in USUAL_ZERO:
             add(f"{word}: zero {s.channel}", part, USUAL_ZERO[word])
-        if word in USUAL_SCALE:
-            # motors and wheels have channels of several quantities, which their unit tells
-            kind = f"{word} {suffix_of(s.channel)}" if word in ("motor", "wheel") else word
+        # motors, wheels and the bus have channels of several quantities, which their unit tells
+        kind = f"{word} {suffix_of(s.channel)}" if word in ("motor", "wheel", "bus") else word
+        usual_scale = USUAL_SCALE.get(kind, USUAL_SCALE.get(word, 0.0))
+        if usual_scale:
             # Of the prediction: measured values would bring their noise into the column, and it would fit that. Of a
             # position it is the way from the start, which odometry measures.
             since = predicted[part] - predicted[s.start] if word == "position" else predicted[part]
-            add(f"{kind}: scale", part, USUAL_SCALE[word] * since)
+            add(f"{kind}: scale", part, usual_scale * since)
         if s.time is not None and s.stop - s.start > 2:
             # A late reading shows what was there before, hence the sign.
             add(f"clock {family(s.channel) or word}: late", part, -USUAL_ERRORS.usual_clock_s * rate[part])

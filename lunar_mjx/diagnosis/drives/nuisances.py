@@ -1,4 +1,5 @@
-"""What nobody knows exactly of a log: its start, the zero of its encoders, how its time compares with finite steps."""
+"""What nobody knows exactly of a log: its start, the zero of its encoders, what its electronics draw, and how its time
+compares with finite steps."""
 
 from __future__ import annotations
 
@@ -40,6 +41,12 @@ class StoodTime:
 
 STOOD_TIME = StoodTime()
 
+ELECTRONICS_QUANTILE = 0.1
+"""1; quantile of a bus's current from which the draw of its electronics is sought: near what it gives at rest, with
+motors that brake for a moment left out."""
+_FARTHEST_DRAW = 6.0
+"""Standard deviations at which that draw is bounded."""
+
 STANDING = (LOG_START.settle, 3.0 * LOG_START.settle)
 """Times of standing that are compared, s."""
 
@@ -47,6 +54,11 @@ STANDING = (LOG_START.settle, 3.0 * LOG_START.settle)
 def is_encoder(series: Series) -> bool:
     """Whether a channel counts a wheel's turns from a zero of its own."""
     return is_quantity(series.channel, "joint_angle", "drive")
+
+
+def is_bus_current(channel: str) -> bool:
+    """Whether a channel (or the nuisance of its name) holds what motors and electronics draw together."""
+    return is_quantity(channel, "bus_current")
 
 
 def standing_shows(change: np.ndarray, number: int, observations: Observations) -> bool:
@@ -123,12 +135,32 @@ def nuisances(number: int, run: LogRun, observations: Observations, stood: bool)
                     log_index=number,
                 )
             )
+        elif s.log == number and is_bus_current(s.channel):
+            coordinates.append(_electronics(number, s, observations))
     return coordinates
+
+
+def _electronics(number: int, series: Series, observations: Observations) -> Coordinate:
+    """The constant current, A, that computers, radios and sensors draw beside the motors, and that nobody logs.
+
+    Its standard deviation is the reading's root mean square: it may be all of the current or nothing of it.
+    """
+    own = slice(series.start, series.stop)
+    measured = observations.value[own]
+    draw = float(np.quantile(measured, ELECTRONICS_QUANTILE))
+    std = float(np.hypot(np.sqrt(np.mean(measured**2)), observations.sigma()[series.start]))
+    far = _FARTHEST_DRAW * std
+    return Coordinate(
+        NUISANCE, series.channel, draw, std, draw - far, draw + far, prior=1.0, unit="A", log_index=number
+    )
 
 
 def is_linear(c: Coordinate) -> bool:
     """Whether a coordinate adds a known vector to the predictions, whatever the others are."""
-    return c.nuisance and (c.name == STEP_ERROR or is_quantity(c.name, "joint_angle", "drive") or is_instrument(c))
+    if not c.nuisance:
+        return False
+    constant = is_quantity(c.name, "joint_angle", "drive") or is_bus_current(c.name)
+    return constant or c.name == STEP_ERROR or is_instrument(c)
 
 
 def direction(c: Coordinate, observations: Observations, step_error: np.ndarray) -> np.ndarray:

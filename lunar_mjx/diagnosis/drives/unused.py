@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
+from lunar_mjx.dynamics.bus import BUS_CURRENT, BUS_VOLTAGE
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.attitude import EULER, QUATERNION
 from lunar_mjx.logs.schema import is_command, is_quantity, parse_name
@@ -11,6 +12,7 @@ from lunar_mjx.logs.schema import is_command, is_quantity, parse_name
 REASONS: Mapping[str, str] = {
     "drawbar_pull": "a pull on a tether is no input of the model yet; compare drives without one",
     "bus_voltage": "the model has no supply; add the effect bus_droop to compare it",
+    "bus_current": "nobody knows the voltage of the bus; log bus_voltage_V, or add bus_droop with the rover's voltage",
     "wheel_slip_angle": "no camera's slip angle is compared yet",
     "left": "the model's rover drives every wheel by a motor of its own",
     "right": "the model's rover drives every wheel by a motor of its own",
@@ -24,8 +26,8 @@ def unused_channels(
 ) -> dict[str, str]:
     """Channels of a log that nothing of a comparison reads, with the reason.
 
-    Commands, imposed speeds, conditions of the environment and quaternions beside their angles are read, though they
-    are not compared.
+    Commands, imposed speeds, conditions of the environment, quaternions beside their angles and the voltage beside the
+    current of the bus are read, though they are not compared.
 
     Args:
       log: of a drive. compared: channels that the problem compares.
@@ -34,6 +36,9 @@ def unused_channels(
     read = {v for v in log.environment.values() if isinstance(v, str)}
     if any(e in compared for e in EULER):
         read |= set(QUATERNION)
+    if BUS_CURRENT in compared:
+        # The power of the motors is divided by it.
+        read.add(BUS_VOLTAGE)
     out = {}
     for name in log.channel_names:
         speed = is_quantity(name, "joint_speed", "drive")

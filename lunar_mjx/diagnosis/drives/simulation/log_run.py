@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UnmappedGround, unmapped_ground
+from lunar_mjx.dynamics.bus import BUS_VOLTAGE, tells_bus_voltage
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, log_model
@@ -65,6 +66,7 @@ class LogRun:
         `joint_speed` (joint,) rad/s, NaN where unknown.
       imu: how the IMU is mounted.
       ground: what nobody knows of the ground, where the log names no map.
+      bus_voltage: (time,) of the bus as the log reads it, V; None where the model predicts it or the log has none.
     """
 
     model: Model
@@ -77,6 +79,7 @@ class LogRun:
     motion: Mapping[str, np.ndarray]
     imu: ImuMounting
     ground: UnmappedGround | None = None
+    bus_voltage: np.ndarray | None = None
 
 
 def log_run(log: Log, model: Model) -> LogRun:
@@ -107,7 +110,17 @@ def log_run(log: Log, model: Model) -> LogRun:
     motion = start_motion(log, own, begin, start["yaw"])
     imu = ImuMounting(log.imu.position_m, log.imu.quaternion)
     ground = unmapped_ground(log, own)
-    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu, ground)
+    times = begin + steps_per_command * own.timestep * np.arange(len(values))
+    bus = None if tells_bus_voltage(model.effect_names) else _bus_voltage(log, times)
+    return LogRun(own, values, steps_per_command, begin, end, start, unknown, motion, imu, ground, bus)
+
+
+def _bus_voltage(log: Log, times: np.ndarray) -> np.ndarray | None:
+    """(n,) voltage of the bus at some times as the log reads it, V; None where it reads none."""
+    samples = log.channel(BUS_VOLTAGE)
+    # A supply that drives a rover has a voltage: what reads none was not connected yet.
+    there = np.zeros(0, bool) if samples is None else samples[1] > 0.0
+    return np.interp(times, samples[0][there], samples[1][there]) if samples is not None and there.any() else None
 
 
 def _start(log: Log, model: Model) -> tuple[dict[str, float], tuple[str, ...]]:

@@ -92,16 +92,18 @@ class Program:
             params, state, commands, self.every, self._axes(params, shared), chunk=commands.shape[0], one_body=True
         )
 
-    def _measure_all(self, params: Params, pieces: Sequence[Any], shared: bool) -> Any:
+    def _measure_all(self, params: Params, bus_voltage: Any, pieces: Sequence[Any], shared: bool) -> Any:
         seen = jax.tree.map(lambda *a: jnp.concatenate(a, axis=1), *pieces)
 
-        def channels(params: Params, seen: Any) -> Any:
+        def channels(params: Params, bus_voltage: Any, seen: Any) -> Any:
             position = self.imu.position if any(self.imu.position) else None
             turn = self.imu.quaternion if any(self.imu.quaternion[1:]) else None
-            measured = with_sides(self.model.rover, measure(self.system, seen, params, position, turn).channels)
+            signals = measure(self.system, seen, params, position, turn, bus_voltage)
+            measured = with_sides(self.model.rover, signals.channels)
             return jnp.stack([measured[c] for c in self.channels])
 
-        return jax.vmap(channels, (self._axes(params, shared), 0))(params, seen)
+        of_bus = None if bus_voltage is None else 0
+        return jax.vmap(channels, (self._axes(params, shared), of_bus, 0))(params, bus_voltage, seen)
 
     def _in_motion(self, state: Any, motion: Mapping[str, Any]) -> Any:
         """A standing rover's state with the velocities of a log that begins in motion."""
@@ -144,7 +146,8 @@ class Program:
                 seen.append(telemetry)
                 if first and not at:
                     _compiling.seconds = time.monotonic() - began
-            measured = self._measure(full, seen, shared=shared)
+            bus = None if logs.bus_voltage is None else logs.bus_voltage[log]
+            measured = self._measure(full, bus, seen, shared=shared)
             size = max(_FEWEST, 1 << (count - 1).bit_length())
             return np.asarray(measured if size >= len(log) else _first(measured, size))
 
@@ -190,6 +193,7 @@ class Logs:
       commands: (logs, time, joint), the last ones repeated up to whole pieces.
       motion: (logs, ...) velocities at the start, by name, as in `LogRun`.
       modes: (logs, modes, rows, cols) of unmapped ground, whose amounts are in `start`; None where all is mapped.
+      bus_voltage: (logs, time) that logs read, V, NaN of those that read none; None where none does.
     """
 
     program: Program
@@ -201,6 +205,7 @@ class Logs:
     commands: np.ndarray
     motion: Mapping[str, np.ndarray]
     modes: Any
+    bus_voltage: np.ndarray | None
 
     def rovers(self, log: np.ndarray, row: np.ndarray, values: Rows) -> tuple[Params, dict[str, np.ndarray]]:
         """Parameters (but for the ground) and starts of rovers: the logs' conditions with rows of values put in."""
@@ -249,7 +254,16 @@ def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun],
         commands=np.stack([_padded(r.commands, length) for r in runs]),
         motion={name: np.stack([r.motion[name] for r in runs]) for name in runs[0].motion},
         modes=modes,
+        bus_voltage=_bus_voltages(runs, length),
     )
+
+
+def _bus_voltages(runs: Sequence[LogRun], length: int) -> np.ndarray | None:
+    """(logs, time) voltages that logs read, as in `Logs`."""
+    if all(r.bus_voltage is None for r in runs):
+        return None
+    read = (np.full(len(r.commands), np.nan) if r.bus_voltage is None else r.bus_voltage for r in runs)
+    return np.stack([_padded(v, length) for v in read])
 
 
 def cores() -> int:
@@ -257,5 +271,5 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _padded(commands: np.ndarray, length: int) -> np.ndarray:
-    return np.concatenate([commands, np.repeat(commands[-1:], length - len(commands), axis=0)])
+def _padded(values: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), axis=0)])

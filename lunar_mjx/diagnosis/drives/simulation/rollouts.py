@@ -15,6 +15,7 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.simulation.log_run import READS_BEFORE, LogRun, log_run
 from lunar_mjx.diagnosis.drives.simulation.program import Logs, Program, Rows, cores, stack_logs
 from lunar_mjx.diagnosis.drives.simulation.simulated_rows import stamp
+from lunar_mjx.dynamics.bus import BUS_CURRENT, BUS_VOLTAGE, tells_bus_voltage
 from lunar_mjx.dynamics.state import Ambient, Params
 from lunar_mjx.effects.sensor.channels import EULER
 from lunar_mjx.inference.coordinates import NUISANCE
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 CHUNK = {"cpu": 32, "gpu": 512}
 """Rovers simulated at once. (2,048 with 44 effects and channels of 50 Hz need more than 22 GiB.)"""
 
-_AT_ONCE = frozenset({"motor_current", "motor_voltage", "motor_torque", "bus_voltage"})
+_AT_ONCE = frozenset({"motor_current", "motor_voltage", "motor_torque", "bus_voltage", "bus_current"})
 """Quantities that jump at the instant at which a command does: no inertia stands between them and the controller."""
 
 _PROGRAMS: dict[Any, Program] = {}
@@ -80,14 +81,18 @@ class Bench:
     def stamp(self) -> tuple[Any, ...]:
         """What all that it simulates depends on beside the rows: programs, and what the logs put into them."""
         given = [
-            (r.commands, dict(r.start), dict(r.motion), r.begin, r.end, r.every, r.imu, r.ground and r.ground.modes)
+            (
+                *(r.commands, dict(r.start), dict(r.motion), r.begin, r.end, r.every, r.imu),
+                *(r.ground and r.ground.modes, r.bus_voltage),
+            )
             for r in self.runs
         ]
         return *(logs.program.number for logs in self._groups()), stamp(self.params, given)
 
     def channels(self, number: int) -> list[str]:
         """Channels of a log that the model gives, in a fixed order."""
-        known = _modelled(self.runs[number].model)
+        run = self.runs[number]
+        known = _modelled(run.model, run.bus_voltage is not None)
         return [c for c in self.logs[number].channel_names if c in known and not c.startswith("quaternion")]
 
     def _program(self, number: int) -> Program:
@@ -291,7 +296,8 @@ def _array(leaf: Any) -> np.ndarray:
     return array.astype(float) if np.issubdtype(array.dtype, np.floating) else array
 
 
-def _modelled(model: Model) -> frozenset[str]:
+def _modelled(model: Model, reads_bus_voltage: bool) -> frozenset[str]:
+    """Channels that a model gives of a log, which may read the voltage of its bus."""
     from lunar_mjx.dynamics.signals import joint_channels, side_channels
 
     joints, corners = joint_channels(model.rover), [w.corner for w in model.rover.wheels]
@@ -306,5 +312,7 @@ def _modelled(model: Model) -> frozenset[str]:
         names += [f"wheel_{c}_force_{a}_N" for a in "xyz"] + [f"wheel_{c}_moment_{a}_Nm" for a in "xyz"]
     names += side_channels(model.rover)
     if "bus_droop" in model.effect_names:
-        names.append("bus_voltage_V")
+        names.append(BUS_VOLTAGE)
+    if reads_bus_voltage or tells_bus_voltage(model.effect_names):
+        names.append(BUS_CURRENT)
     return frozenset(names)

@@ -45,6 +45,7 @@ MOST_WINDOWS = 60
 UNUSED = {
     "position": "a speed over ground needs a heading that is known, yaw_deg",
     "accelerometer": "the slope needs all three axes of it, or roll and pitch",
+    "bus_current": "imposed speeds are judged by a current per motor or side; log commands to compare that of the bus",
 }
 """Why channels are in no window, by their quantity."""
 
