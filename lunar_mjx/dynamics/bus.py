@@ -25,10 +25,10 @@ def bus_current(seen: Telemetry, params: Params, voltage: Any = None) -> Any:
     """The current that the battery or bus gives, A: (P_drawn - P_solar)/V_bus, positive when drawn.
 
     A motor behind an amplifier with pulse-width modulation takes its power from the bus, and not its current: at half
-    of the bus's voltage it takes half of its current. With effects at the port `power` P_drawn is their load; else it
-    is the sum of V_m I_m over all motors, with what their harness loses: lossless amplifiers, by which the power of
-    braking motors flows back, first into the other motors. What nobody told the model of, such as the electronics,
-    is not in it.
+    of the bus's voltage it takes half of its current. P_drawn is the sum of V_m I_m over all motors: lossless
+    amplifiers, by which the power of braking motors flows back, first into the other motors; or what `motor_power`
+    makes of it, where the model has that. What the harness loses is in it, and the load of other effects at the port
+    `power`. What nobody told the model of, such as its electronics, is not.
 
     Args:
       seen: telemetry, (time,) or (batch, time).
@@ -43,12 +43,14 @@ def bus_current(seen: Telemetry, params: Params, voltage: Any = None) -> Any:
         voltage = _own_voltage(seen, params, motors)
     if voltage is None:
         return None
+    power = 0.0 if "motor_power" in params.effects else motors
+    harness = params.effects.get("harness_resistance")
+    if harness is not None:
+        power = power + jnp.sum(harness["resistance"] * seen.current**2, axis=-1)
     supply = seen.supply
     if supply is not None and supply.load is not None and supply.solar is not None:
-        return (supply.load - supply.solar) / voltage
-    harness = params.effects.get("harness_resistance")
-    lost = 0.0 if harness is None else jnp.sum(harness["resistance"] * seen.current**2, axis=-1)
-    return (motors + lost) / voltage
+        power = power + supply.load - supply.solar
+    return power / voltage
 
 
 def _own_voltage(seen: Telemetry, params: Params, motors: Any) -> Any:

@@ -123,7 +123,7 @@ def estimated_noise(log: Log, channel: str, moving: bool) -> ChannelNoise | None
     if samples is None or is_command(channel):
         return None
     time, values = samples
-    step, windows = _windows(time, values, _moving(log, time, channel), moving)
+    step, windows = _windows(time, values, moving_at(log, time), moving)
     if windows.shape[1] < NOISE_ESTIMATE.fewest_windows:
         return None
     share, correlation_time = _colour(step, windows)
@@ -169,7 +169,7 @@ def noise_table(logs: Sequence[Log]) -> dict[str, dict[str, ChannelNoise]]:
     return out
 
 
-def _moving(log: Log, time: np.ndarray, channel: str) -> np.ndarray:
+def moving_at(log: Log, time: np.ndarray) -> np.ndarray:
     """(n,) whether any wheel turns at some times; everywhere where no channel tells."""
     for quantity in ("joint_speed", "command_speed"):
         names = [c for c in log.channel_names if is_quantity(c, quantity, "drive")]

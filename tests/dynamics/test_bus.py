@@ -52,5 +52,9 @@ def test_a_model_with_a_supply_needs_no_voltage_from_elsewhere() -> None:
     assert channels(droop)["bus_current_A"] == pytest.approx(POWER / sagged, rel=1e-6)
     assert channels(droop, voltage=24.0)["bus_current_A"] == pytest.approx(POWER / 24.0, rel=1e-6)
     supply = Supply(load=np.array([90.0, 60.0]), solar=np.array([0.0, 80.0]), voltage=np.array([30.0, 20.0]))
-    assert channels(supply=supply)["bus_current_A"] == pytest.approx([3.0, -1.0], rel=1e-12)
+    motors = catalogue.get("motor_power")
+    assert channels(motors, supply=supply)["bus_current_A"] == pytest.approx([3.0, -1.0], rel=1e-12)
+    of_others = np.array([90.0, -20.0])
+    expected = (POWER + of_others) / [30.0, 20.0]
+    assert channels(supply=supply)["bus_current_A"] == pytest.approx(expected, rel=1e-12), "electronics alone"
     assert tells_bus_voltage(("motor", "battery")) and not tells_bus_voltage(("motor", "electronics"))

@@ -325,13 +325,26 @@ def test_the_current_of_the_bus(electronics: float, factor: float, kind: str, wo
     assert all(words in f.message and f.severity == "bad_data" for f in found)
 
 
-def test_a_bus_that_is_charged_downhill_or_by_panels_is_no_mistake(tmp_path: Path) -> None:
+def test_a_bus_that_is_charged_is_no_mistake(tmp_path: Path) -> None:
     def panels(tables: Tables) -> None:
         tables["drive"]["bus_solar_W"] = 100.0 + np.random.default_rng(0).standard_normal(len(tables["drive"]))
 
-    for name, more in (("slope", downhill), ("panels", panels)):
-        found = check(make_log(tmp_path / name, with_bus(1.0, -1.0, more)))
+    for name, change in (
+        ("slope", with_bus(1.0, -1.0, downhill)),
+        ("panels", with_bus(1.0, -1.0, panels)),
+        ("on a dock", with_bus(-5.0, 1.0)),
+    ):
+        found = check(make_log(tmp_path / name, change))
         assert not [f for f in found if f.column == "bus_current_A"], name
+
+
+def test_a_bus_without_a_rest_is_warned_of(tmp_path: Path) -> None:
+    def driving(tables: Tables) -> None:
+        tables["drive"] = tables["drive"].iloc[100:300].reset_index(drop=True)
+        tables["thermal"] = tables["thermal"].iloc[5:15].reset_index(drop=True)
+
+    (found,) = (f for f in check(make_log(tmp_path / "a", with_bus(1.0, -1.0, driving))) if f.column == "bus_current_A")
+    assert found.severity == "warning" and "if none charged" in found.message
 
 
 @pytest.mark.parametrize(("share", "bad"), [(0.35, False), (0.7, True)])

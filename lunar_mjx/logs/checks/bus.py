@@ -8,10 +8,11 @@ import numpy as np
 
 from lunar_mjx.dynamics.bus import BUS_CURRENT
 from lunar_mjx.logs.checks.frames import _finding
-from lunar_mjx.logs.findings import Finding
+from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import Log
+from lunar_mjx.logs.noise import moving_at
 from lunar_mjx.logs.schema import is_quantity, parse_name
-from lunar_mjx.logs.series import edges, known_at, means, sigma, span
+from lunar_mjx.logs.series import at, continuous, known, known_at, sigma, span
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +25,8 @@ class BusLimits:
     """A; a mean size below which a current tells no sign. A single-board computer at 12 V draws several times that."""
     level: float = 2.0
     """deg of pitch beyond which motors may brake, and charge the battery, all the way."""
-    windows: int = 8
-    """Level windows that tell a sign."""
+    samples: int = 40
+    """Samples on level ground that tell a sign; a quarter of them tells rest, or motion."""
     many: float = 30.0
     """Factor by which a bus's current may vary beyond all motors' currents together: motors alone give no more than
     1, as no amplifier gives more than the bus's voltage, and heaters that are switched a few."""
@@ -36,26 +37,37 @@ BUS_LIMITS = BusLimits()
 
 def check_bus(log: Log) -> list[Finding]:
     """Findings on the current of the bus; none where the log has no such channel."""
-    limits = span(log, (BUS_CURRENT,))
-    return [] if limits is None else _sign(log, limits) or _size(log)
+    return [] if continuous(log, BUS_CURRENT) is None else _sign(log) or _size(log)
 
 
-def _sign(log: Log, limits: tuple[float, float]) -> list[Finding]:
-    """A finding of a current that is negative on the whole, as battery monitors write what is discharged."""
+def _sign(log: Log) -> list[Finding]:
+    """A finding of a current that is negative on the whole, as battery monitors write what is discharged.
+
+    Where it falls as the wheels turn, its sign is wrong; where it rises, something charges the battery. A log without
+    rest, or without motion, tells neither and gets a warning.
+    """
     # Panels may well give more than the rover takes.
     if "bus_solar_W" in log.channel_names:
         return []
-    windows = edges(*limits)
-    current = means(log, BUS_CURRENT, windows)
-    if span(log, (BUS_CURRENT, "pitch_deg")) == limits:
-        current = current[np.abs(means(log, "pitch_deg", windows)) < BUS_LIMITS.level]
-    size = float(np.abs(current).mean()) if len(current) >= BUS_LIMITS.windows else 0.0
-    if size <= max(BUS_LIMITS.least, 3.0 * sigma(log, BUS_CURRENT)):
+    time, current = known(log, BUS_CURRENT)
+    pitch = at(log, "pitch_deg", time)
+    # Beyond the span of the pitch nobody knows the slope: level, as where no pitch was logged.
+    level = np.ones(len(time), bool) if pitch is None else ~(np.abs(pitch) >= BUS_LIMITS.level)
+    moves, current = moving_at(log, time)[level], current[level]
+    size = float(np.abs(current).mean()) if len(current) >= BUS_LIMITS.samples else 0.0
+    if size <= max(BUS_LIMITS.least, 3.0 * sigma(log, BUS_CURRENT)) or current.mean() > BUS_LIMITS.gives * size:
         return []
-    if float(current.mean()) > BUS_LIMITS.gives * size:
+    text = f"is negative on the whole (mean {current.mean():.3g} A), as if the battery were charged"
+    told = min(moves.sum(), (~moves).sum()) >= BUS_LIMITS.samples / 4
+    if not told:
+        found = _finding(
+            log, BUS_CURRENT, "frame", f"{text}; what is drawn is positive: change its sign if none charged"
+        )
+        return [dataclasses.replace(found, severity=WARNING)]
+    if current[moves].mean() > current[~moves].mean():
         return []
-    text = f"is negative on the whole (mean {current.mean():.3g} A), as if the rover charged its battery by driving"
-    return [_finding(log, BUS_CURRENT, "frame", f"{text}; what is drawn is positive: change its sign")]
+    text = f"{text}, and all the more as the wheels turn; what is drawn is positive: change its sign"
+    return [_finding(log, BUS_CURRENT, "frame", text)]
 
 
 def _size(log: Log) -> list[Finding]:
