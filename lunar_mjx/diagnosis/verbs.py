@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from lunar_mjx.diagnosis.build_problem import (
     require_discrepancy,
     require_splits,
 )
-from lunar_mjx.diagnosis.contact_laws import better_law
+from lunar_mjx.diagnosis.contact_laws import LAWS, better_law
 from lunar_mjx.diagnosis.drives.baseline import with_nominal_controller
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -331,7 +332,9 @@ def improve(
 ) -> tuple[Diagnosis, list[Run]]:
     """The whole loop unattended: compare, why, add, while the verdict names something or is UNKNOWN.
 
-    What a round adds is every effect that is more probable than not. Where there is none the loop ends, too.
+    What a round adds is every effect that is more probable than not. Where there is none the loop ends, too. A contact
+    law with which the model itself predicts the fitted measurements worse than before is taken back: what had been
+    added for the old law went with it.
 
     Args:
       logs, model, effects, splits, seed, discrepancy, progress, settings: as for `compare`.
@@ -359,8 +362,24 @@ def improve(
         if windows.imposed(campaign):
             run = add(run, names[0], place, progress)
         else:
-            run = _add(run, campaign, names, place, progress, {})
+            grown = _add(run, campaign, names, place, progress, {})
+            if _LAWS & set(names) and _fitted_error(grown) > _fitted_error(run):
+                shutil.rmtree(place)
+                names = [n for n in names if n not in _LAWS]
+                if not names:
+                    return diagnosis, runs
+                grown = _add(run, campaign, names, place, progress, {})
+            run = grown
         runs.append(run)
+
+
+_LAWS = frozenset(parts[0] for parts in LAWS.values())
+"""Effects by which contact laws are added."""
+
+
+def _fitted_error(run: Run) -> float:
+    """Error, in sigma, of the model alone in the fitted measurements of a comparison."""
+    return float(run.load(COMPARISON_FILE)["refitted"]["fit"])
 
 
 def _add(

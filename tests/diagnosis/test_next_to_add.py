@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from lunar_mjx.diagnosis import verbs
 from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.verbs import _next_to_add
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
@@ -61,3 +62,40 @@ def test_what_a_model_has_is_not_added_again(tmp_path):
     model = make_model("luvmi_x", terrain="flat", preset="consistent").add("side_wall", "add")
     said = Diagnosis(Verdict.KNOWN, ("side_wall",), "", inclusion={"side_wall": 0.99, "exit_angle": 0.6})
     assert _next_to_add(said, Run(tmp_path, (), model)) == ["exit_angle"]
+
+
+@pytest.mark.parametrize(("beside", "kept"), [((), []), (("side_wall",), [["side_wall"]])])
+def test_a_law_with_which_the_model_itself_fits_worse_is_taken_back(tmp_path, monkeypatch, beside, kept):
+    """Its folder is gone, and what was to be added beside it is added without it."""
+    model = make_model("luvmi_x", terrain="flat", preset="consistent")
+    error = {(): 4.0, ("granular_resistance", *beside): 8.0, ("side_wall",): 3.0}
+    added = []
+
+    def compared(names, folder):
+        run = Run(folder, (), model)
+        run.folder.mkdir()
+        (run.folder / "error").write_text(str(error[tuple(names)]))
+        return run
+
+    def add(run, logs, names, out, progress, values):
+        added.append(list(names))
+        return compared(names, out)
+
+    def why(run, progress):
+        first = run.folder.name == "run1"
+        forms = {"closed form": 0.02, "granular_resistance": 0.98} if first else {}
+        return Diagnosis(
+            Verdict.KNOWN if first and beside else Verdict.NOISE_ONLY, beside if first else (), "", forms=forms
+        )
+
+    monkeypatch.setattr(verbs, "compare", lambda logs, model, out, *rest: compared((), out))
+    monkeypatch.setattr(verbs, "why", why)
+    monkeypatch.setattr(verbs, "_add", add)
+    monkeypatch.setattr(verbs, "gate", lambda run: [])
+    monkeypatch.setattr(verbs, "_fitted_error", lambda run: float((run.folder / "error").read_text()))
+    monkeypatch.setattr(verbs.windows, "imposed", lambda campaign: False)
+    _, runs = verbs.improve([], model, tmp_path)
+    assert added == [["granular_resistance", *beside], *kept]
+    assert [r.folder.name for r in runs] == [f"run{k + 1}" for k in range(1 + len(kept))]
+    assert {p.name for p in tmp_path.iterdir()} == {r.folder.name for r in runs}
+    assert all(verbs._fitted_error(r) <= 4.0 for r in runs)
