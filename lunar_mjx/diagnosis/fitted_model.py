@@ -33,7 +33,7 @@ def fitted_model(
         c = coordinates[i]
         if c.nuisance or c.effect not in model.effect_names or c.name in (held or {}):
             continue
-        value = min(max(float(c.value(u[i])), c.low), c.high)
+        value = c.value_within(u[i])
         old = model.parameters[c.effect][c.name]
         low, high = next(e for e in model.effects if e.name == c.effect).parameters[c.name].bounds
         # A factor keeps the differences between wheels that the model holds; a plain value is one for all of them.

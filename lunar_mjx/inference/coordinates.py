@@ -61,6 +61,10 @@ class Coordinate:
         """The value at a coordinate."""
         return self.start * np.exp(self.scale * np.asarray(u)) if self.log else self.start + self.scale * np.asarray(u)
 
+    def value_within(self, u: float) -> float:
+        """The value at a coordinate, within its bounds: a coordinate that lies at its bound may round beyond it."""
+        return min(max(float(self.value(u)), self.low), self.high)
+
     def std(self, u: float, std_u: float) -> float:
         """Standard deviation of the value, from that of the coordinate, to first order."""
         return abs(float(self.value(u)) * self.scale * std_u) if self.log else abs(self.scale * std_u)

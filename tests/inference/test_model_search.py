@@ -11,8 +11,8 @@ import pytest
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
-from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Term, shifted
-from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, search
+from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Term, shifted
+from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, _Search, search
 from tests.inference.toy_form import EFFECTS, NOISE, ToyForm, TwoValleys, X, curve, measured
 
 
@@ -334,3 +334,20 @@ def test_an_effect_ten_times_its_nominal_size_is_rare_and_no_miracle():
     # A look at a few sizes picks about as well.
     looked = [one.at_sizes(terms, (sizes.tau, sizes.noise)) for one in (gaussian, cauchy)]
     assert looked[1] - looked[0] > 20.0
+
+
+def test_no_estimate_leads_for_good_because_of_something_unlisted_beside_it():
+    """What is unlisted needs no refit, the effects beside it do; and their refit replaces every estimate of them."""
+    form = ToyForm(measured(4, wave=0.8))
+    going = _Search([form], 30, 4, 4.0, 1.0, 0.5, 100, lambda text, share: None)
+    going.begin()
+    base = going.known["toy", frozenset()]
+    going.refit(form, frozenset({"wave", "twin"}), base)
+    level = next(t for t in form.terms if t.kind == UNLISTED)
+    key = "toy", form.listed(frozenset({"twin"})) | {level}
+    assert not going.known[key].refitted
+    top = max(h.log_posterior for h in going.known.values())
+    going.known[key] = dataclasses.replace(going.known[key], log_posterior=top + 50.0)
+    while going.may_refit and going.go_on(lambda found: None):
+        pass
+    assert going.known[key].refitted and going.known[key].log_posterior < top

@@ -126,7 +126,7 @@ def grown_model(
     for i, c in enumerate(form.coordinates):
         mine = i in form.baseline or c.effect in new
         if mine and c.effect in model.effect_names and c.name not in values:
-            value = float(c.value(alone[i]))
+            value = c.value_within(alone[i])
             old = model.parameters[c.effect][c.name]
             model = model.set(
                 c.effect, "fit", **{c.name: tuple(value for _ in old) if isinstance(old, tuple) else value}

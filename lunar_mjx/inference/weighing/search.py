@@ -255,7 +255,10 @@ class _Search:
                 self.refit(form, wanted, leads, alike[0])
             provisional(self.ranked(False))
             return True
+        # What is unlisted needs no refit, but the effects beside it do: else an estimate without one could lead for good.
+        top = max(h.log_posterior for h in self.known.values())
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
+        near += [h for h in self.known.values() if h.log_posterior > top - self.window]
         open_ = [h for h in near if (h.form, h.effects) not in self.done]
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
         # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
@@ -327,6 +330,9 @@ class _Search:
         estimated = self.known.get((form.name, listed))
         if self.score_around(form, made, near):
             self.done[key] = made
+            # Estimates from elsewhere of what is unlisted beside these effects give way to what their own refit says.
+            for h in [h for h in self.known.values() if (h.form, h.effects) == key and not h.refitted]:
+                self.score(form, made, listed, h.terms, _sizes(h))
             if estimated is not None and estimated.promise is not None and not made.failed:
                 self.hold(estimated.promise, self.known[form.name, listed])
         elif key not in self.done:
