@@ -255,7 +255,7 @@ class _Search:
                 self.refit(form, wanted, leads, alike[0])
             provisional(self.ranked(False))
             return True
-        # What is unlisted needs no refit, but the effects beside it do: else an estimate without one could lead for good.
+        # What is unlisted needs no refit, the effects beside it do: else an estimate without one could lead for good.
         top = max(h.log_posterior for h in self.known.values())
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
         near += [h for h in self.known.values() if h.log_posterior > top - self.window]
