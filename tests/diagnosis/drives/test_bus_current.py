@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,6 +94,14 @@ def test_the_model_s_own_supply_comes_first_and_a_suspected_one_changes_nothing(
     np.testing.assert_allclose(residual(problem, u)[BUS], plain, atol=1e-6)
 
 
+def begun(table: Any, seconds: float) -> Any:
+    """The first seconds of a table of a log."""
+    kept = table.time_s < table.time_s[0] + seconds
+    return dataclasses.replace(
+        table, time_s=table.time_s[kept], channels={c: v[kept] for c, v in table.channels.items()}
+    )
+
+
 def test_without_a_voltage_it_is_not_used_and_told_once(log: Log, model: Model) -> None:
     lost = without(log, VOLTAGE)
     problem = DriveProblem([lost], model, {})
@@ -106,5 +115,9 @@ def test_without_a_voltage_it_is_not_used_and_told_once(log: Log, model: Model) 
     mixed = DriveProblem([lost, log], model, {})
     assert [s.log for s in mixed.observations.series if s.channel == BUS] == [1]
     assert np.isfinite(mixed.predict(mixed.origin()[None])).all()
+    # of another length, so that they share a program and no stack of logs
+    short = dataclasses.replace(lost, tables={k: begun(t, 2.0) for k, t in lost.tables.items()})
+    uneven = DriveProblem([short, log], model, {})
+    assert len(uneven.bench._groups()) == 2 and np.isfinite(uneven.predict(uneven.origin()[None])).all()
     supplied = DriveProblem([lost, log], model.add("bus_droop"), {})
     assert all(BUS in supplied.bench.channels(n) for n in (0, 1)) and "voltage" not in supplied.unused

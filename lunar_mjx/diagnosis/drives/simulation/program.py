@@ -18,6 +18,7 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.simulation.log_run import LOG_START, STOOD, ImuMounting, LogRun
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import UNMAPPED_GRID, mode_name
 from lunar_mjx.dynamics import System, build
+from lunar_mjx.dynamics.bus import BUS_CURRENT, tells_bus_voltage
 from lunar_mjx.dynamics.signals import measure, with_sides
 from lunar_mjx.dynamics.state import Params
 from lunar_mjx.inference.coordinates import NUISANCE
@@ -254,13 +255,15 @@ def stack_logs(program: Program, numbers: Sequence[int], runs: Sequence[LogRun],
         commands=np.stack([_padded(r.commands, length) for r in runs]),
         motion={name: np.stack([r.motion[name] for r in runs]) for name in runs[0].motion},
         modes=modes,
-        bus_voltage=_bus_voltages(runs, length),
+        bus_voltage=_bus_voltages(program, runs, length),
     )
 
 
-def _bus_voltages(runs: Sequence[LogRun], length: int) -> np.ndarray | None:
+def _bus_voltages(program: Program, runs: Sequence[LogRun], length: int) -> np.ndarray | None:
     """(logs, time) voltages that logs read, as in `Logs`."""
-    if all(r.bus_voltage is None for r in runs):
+    # a program that tells the current for logs of another length has to be told some voltage here, too
+    told = BUS_CURRENT in program.channels and not tells_bus_voltage(program.model.effect_names)
+    if not told and all(r.bus_voltage is None for r in runs):
         return None
     read = (np.full(len(r.commands), np.nan) if r.bus_voltage is None else r.bus_voltage for r in runs)
     return np.stack([_padded(v, length) for v in read])
