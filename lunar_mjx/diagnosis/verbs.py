@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import math
-import shutil
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from lunar_mjx.diagnosis.build_problem import (
     require_discrepancy,
     require_splits,
 )
-from lunar_mjx.diagnosis.contact_laws import LAWS, better_law
+from lunar_mjx.diagnosis.contact_laws import LAWS, better_law, no_addition
 from lunar_mjx.diagnosis.drives.baseline import with_nominal_controller
 from lunar_mjx.diagnosis.drives.loop import build_drives, grown_drives
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
@@ -363,10 +363,13 @@ def improve(
             run = add(run, names[0], place, progress)
         else:
             grown = _add(run, campaign, names, place, progress, {})
-            if _LAWS & set(names) and _fitted_error(grown) > _fitted_error(run):
-                shutil.rmtree(place)
-                names = [n for n in names if n not in _LAWS]
+            if _LAWS & set(names) and not _fitted_error(grown) <= _fitted_error(run):
+                progress("taking the contact law back: with it the model itself fits worse", math.nan)
+                present = run.model.effect_names
+                names = [n for n in names if n not in _LAWS and not no_addition(present, n)]
                 if not names:
+                    # kept beside the runs: it has opened what was held out, and may hold files of its user
+                    place.rename(next(p for k in itertools.count(1) if not (p := out / f"taken_back{k}").exists()))
                     return diagnosis, runs
                 grown = _add(run, campaign, names, place, progress, {})
             run = grown

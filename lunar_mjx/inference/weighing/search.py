@@ -256,9 +256,10 @@ class _Search:
             provisional(self.ranked(False))
             return True
         # What is unlisted needs no refit, the effects beside it do: else an estimate without one could lead for good.
-        top = max(h.log_posterior for h in self.known.values())
+        alive = [h for h in self.known.values() if self.done.get((h.form, h.effects), h.refit) is not None]
+        top = max(h.log_posterior for h in alive)
         near = [h for h in listed if h.log_posterior > best.log_posterior - self.window]
-        near += [h for h in self.known.values() if h.log_posterior > top - self.window]
+        near += [h for h in alive if h.log_posterior > top - self.window]
         open_ = [h for h in near if (h.form, h.effects) not in self.done]
         # Linear estimates from another form's refit do not exist: what is best beside one is tried beside all, in the
         # order of what it promises there. Else one form's many neighbours would take the refits that tell which it is.
@@ -332,6 +333,7 @@ class _Search:
             self.done[key] = made
             # Estimates from elsewhere of what is unlisted beside these effects give way to what their own refit says.
             for h in [h for h in self.known.values() if (h.form, h.effects) == key and not h.refitted]:
+                del self.known[h.form, h.terms]
                 self.score(form, made, listed, h.terms, _sizes(h))
             if estimated is not None and estimated.promise is not None and not made.failed:
                 self.hold(estimated.promise, self.known[form.name, listed])
