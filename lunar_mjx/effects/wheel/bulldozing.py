@@ -11,7 +11,7 @@ from lunar_mjx.effects.base import Parameter, effect
 from lunar_mjx.effects.wheel.closed_form import contact_with_soil, grounded, janosi
 from lunar_mjx.spatial import Vec3
 
-_STILL: Annotated[float, "m/s"] = 2e-3
+STILL: Annotated[float, "m/s"] = 2e-3
 """m/s; below it a wheel counts as standing, as for the slip ratio."""
 
 
@@ -83,7 +83,7 @@ def bulldozing(ctx, p, x, wheel):
     # A wall that has not moved yet meets no passive pressure (Janosi's curve stands for the way).
     # The displacement of the shear refers to the faster of rim and travel, and is kept at rest, where v_y/v_x is lost.
     fastest = jnp.maximum(jnp.abs(contact.rim_speed), jnp.abs(contact.v_x))
-    passed = jnp.sqrt((fastest**2 + _STILL**2) / (contact.v_x**2 + _STILL**2))
+    passed = jnp.sqrt((fastest**2 + STILL**2) / (contact.v_x**2 + STILL**2))
     moved = janosi(0.625 * length * passed * wheel.slip_y, p.build_up * soil.shear_modulus_y)
     wall = passive_pressure(soil, weight, 2.0 / 3.0 * z, 8.0 / 15.0 * z * z)
     side = -p.side * soft * length * wall * moved

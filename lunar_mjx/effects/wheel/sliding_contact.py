@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
 
 from lunar_mjx.effects.base import Effect, Parameter, effect
-from lunar_mjx.effects.wheel.bulldozing import BULK_DENSITY
+from lunar_mjx.effects.wheel.bulldozing import BULK_DENSITY, STILL
 from lunar_mjx.effects.wheel.closed_form import contact_with_soil, first_axis, grounded, mean_decay, sin_difference
 from lunar_mjx.spatial import Vec3
-
-_STILL: Annotated[float, "m/s"] = 2e-3
-"""m/s; below it a wheel counts as standing, as for the slip ratio."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +39,7 @@ _ALONG, _ALONG_WEIGHTS = (a.tolist() for a in np.polynomial.legendre.leggauss(6)
 def slip_angle_tangent(contact):
     """|v_y|/|v_x|, fading to 0 at standstill; 1000 at most."""
     # Bounded by a share of v_y itself: broadside, the quotient would be infinite.
-    return jnp.abs(contact.v_y) / jnp.sqrt(contact.v_x**2 + (1e-3 * contact.v_y) ** 2 + _STILL**2)
+    return jnp.abs(contact.v_y) / jnp.sqrt(contact.v_x**2 + (1e-3 * contact.v_y) ** 2 + STILL**2)
 
 
 def scaled_stress(ctx, normal, factor):
@@ -88,9 +84,9 @@ def slide_softening(ctx, p, x, ground):
     as a whole, slip, skid and slip angle in one.
     """
     c = ctx.contact
-    fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + _STILL**2))
+    fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + STILL**2))
     # eq. 8 has the larger of rim and forward speed below
-    along = c.soil_slid * jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + _STILL**2)) / fastest
+    along = c.soil_slid * jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + STILL**2)) / fastest
     across = c.v_y / fastest
     sliding = jnp.sqrt(along**2 + across**2 + SLIDING.flat**2) - SLIDING.flat
     factor = 1.0 / (1.0 + p.softening * sliding)
@@ -162,7 +158,7 @@ def shear_softening(ctx, p, x, normal):
     slip_x = slip / (1.0 + SLIDING.longest * jnp.minimum(slip, 0.0))
     rim, travel = jnp.abs(contact.rim_speed), jnp.abs(contact.v_x)
     pace = rim + (1.0 - SLIDING.longest) * jnp.maximum(travel - rim, 0.0)
-    slip_y = contact.v_y / jnp.sqrt(pace**2 + _STILL**2)
+    slip_y = contact.v_y / jnp.sqrt(pace**2 + STILL**2)
 
     def factor(theta):
         arc = sin_difference(normal.entrance, theta)
@@ -194,7 +190,7 @@ def side_exit(ctx, p, x, normal):
     `exit_angle` gives contact behind the axle. Reason stated here.
     """
     c = ctx.contact
-    fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + _STILL**2))
+    fastest = jnp.maximum(jnp.abs(c.rim_speed), jnp.sqrt(c.v_x**2 + c.v_y**2 + STILL**2))
     gone = p.lost * jnp.abs(c.v_y) / fastest
     return scaled_stress(ctx, normal, lambda theta: jnp.where(theta < 0.0, 1.0 - gone, 1.0))
 

@@ -249,7 +249,7 @@ def test_the_law_of_an_effect_that_was_added_is_inexact_too(folder):
     assert set(linear.inexact["rolling_resistance"]) <= set(linear.evidence(frozenset())[2])
 
 
-def test_what_the_law_of_an_effect_gets_wrong_speaks_for_no_second_one(folder, monkeypatch):
+def test_an_effect_whose_law_is_uneven_has_more_evidence_where_laws_may_be_inexact(folder, monkeypatch):
     def resist(frame):
         # half as strong at the strongest slip
         share = 1.0 - 0.5 * (frame["slip_ratio"] + 0.1) / 0.7
