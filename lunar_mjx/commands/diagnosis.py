@@ -472,6 +472,10 @@ def _print_steps(runs: Sequence[Run]) -> None:
             foreseen = held_out
         if said:
             console.print(f"  {said.get('verdict')}: {said.get('sentence')}", highlight=False)
+        for refusal in (said.get("details") or {}).get("taken_back") or []:
+            # A verdict tells of all laws that were taken back so far; a step only of those tried after it.
+            if refusal["run"] == run.folder.name:
+                console.print(f"  {refusal['sentence']}", highlight=False)
 
 
 def _shown(value: float | None) -> str:
@@ -521,6 +525,8 @@ def print_probabilities(diagnosis: Diagnosis, console: Any) -> None:
     console.print(table)
     if len(diagnosis.forms) > 1:
         console.print("Contact law: " + ", ".join(f"{n} {p:.3f}" for n, p in diagnosis.forms.items()), highlight=False)
+    for refusal in diagnosis.details.get("taken_back", []):
+        console.print(refusal["sentence"], highlight=False)
     remains = "; ".join(
         f"{d['text']} ({100.0 * d['low']:.2g} to {100.0 * d['high']:.2g} %)" for d in diagnosis.discrepancy.values()
     )

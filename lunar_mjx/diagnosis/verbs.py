@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -334,7 +334,8 @@ def improve(
 
     What a round adds is every effect that is more probable than not. Where there is none the loop ends, too. A contact
     law with which the model itself predicts the fitted measurements worse than before is taken back: what had been
-    added for the old law went with it.
+    added for the old law went with it. It is not tried again, and the details of every later verdict tell of it, as
+    `taken_back`.
 
     Args:
       logs, model, effects, splits, seed, discrepancy, progress, settings: as for `compare`.
@@ -350,9 +351,13 @@ def improve(
     except BadData as bad:
         return bad.diagnosis, []
     runs = [run]
+    refused: list[dict[str, Any]] = []
     while True:
-        diagnosis = why(run, progress=progress)
+        diagnosis = _telling_of(refused, why(run, progress=progress), run)
+        present = run.model.effect_names
         names = _next_to_add(diagnosis, run)
+        if not {r["law"] for r in refused}.isdisjoint(names):
+            names = _without_law(names, present)
         if not names or len(runs) > most:
             return diagnosis, runs
         # A verdict calls the user's own effects by their bare names; to be added again they need their file.
@@ -365,8 +370,9 @@ def improve(
             grown = _add(run, campaign, names, place, progress, {})
             if _LAWS & set(names) and not _fitted_error(grown) <= _fitted_error(run):
                 progress("taking the contact law back: with it the model itself fits worse", math.nan)
-                present = run.model.effect_names
-                names = [n for n in names if n not in _LAWS and not no_addition(present, n)]
+                refused.append(_refusal(names, run, grown))
+                diagnosis = _telling_of(refused, diagnosis, run)
+                names = _without_law(names, present)
                 if not names:
                     # kept beside the runs: it has opened what was held out, and may hold files of its user
                     place.rename(next(p for k in itertools.count(1) if not (p := out / f"taken_back{k}").exists()))
@@ -378,6 +384,42 @@ def improve(
 
 _LAWS = frozenset(parts[0] for parts in LAWS.values())
 """Effects by which contact laws are added."""
+
+
+def _without_law(names: Sequence[str], present: Collection[str]) -> list[str]:
+    """Effects to add to those of a model, without contact laws and without what is no addition to the model's own."""
+    return [n for n in names if n not in _LAWS and not no_addition(present, n)]
+
+
+def _refusal(names: Sequence[str], run: Run, grown: Run) -> dict[str, Any]:
+    """What is told of a contact law that is taken back.
+
+    Args:
+      names: what was added, a law and the effects beside it. run, grown: before and after.
+
+    Returns:
+      The `law`, the effects added `beside` it, the `run` before, the errors `before` and `after` of the model alone in
+      the fitted measurements, sigma, and the `sentence` that says so.
+    """
+    law = next(n for n in names if n in _LAWS)
+    beside = [n for n in names if n != law]
+    before, after = _fitted_error(run), _fitted_error(grown)
+    also = f" and with {', '.join(beside)}" if beside else ""
+    name = run.folder.name
+    sentence = (
+        f"{law} was taken back: in place of the contact law of {name}{also} the model itself fits worse, "
+        f"{after:.3g} sigma in the fitted measurements where it had {before:.3g}."
+    )
+    return {"law": law, "beside": beside, "run": name, "before": before, "after": after, "sentence": sentence}
+
+
+def _telling_of(refused: Sequence[Mapping[str, Any]], diagnosis: Diagnosis, run: Run) -> Diagnosis:
+    """A run's verdict with the contact laws that were taken back so far; the run's file of it tells of them, too."""
+    if not refused:
+        return diagnosis
+    diagnosis = dataclasses.replace(diagnosis, details={**diagnosis.details, "taken_back": list(refused)})
+    run.save(VERDICT_FILE, diagnosis.to_dict())
+    return diagnosis
 
 
 def _fitted_error(run: Run) -> float:

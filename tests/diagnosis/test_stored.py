@@ -104,6 +104,7 @@ BAD_RESULTS = [
     ("verdict.json", {"evidence": [{**EVIDENCE, "separable_sigma": "x"}]}),
     ("verdict.json", {"details": {"held_out": 5}}),
     ("verdict.json", {"details": {"parameters": 5}}),
+    ("verdict.json", {"details": {"taken_back": [{"law": "stress_integral"}]}}),
     ("verdict.json", {"probabilities": 5}),
     ("verdict.json", {"probabilities": {"nothing": "x"}}),
     ("verdict.json", {"forms": 5}),

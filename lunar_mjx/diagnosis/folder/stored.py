@@ -78,10 +78,17 @@ class _Remains(_Stored):
     high: Number
 
 
+class _TakenBack(_Stored):
+    law: str
+    run: str
+    sentence: str
+
+
 class _Details(_Stored):
     held_out: dict[str, Any] | None = None
     parameters: dict[str, dict[str, dict[str, Any] | None]] | None = None
     findings: list[dict[str, Any]] | None = None
+    taken_back: list[_TakenBack] | None = None
 
 
 class _Verdict(_Stored):

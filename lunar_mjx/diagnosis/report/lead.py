@@ -121,7 +121,8 @@ def _law(judge: Result) -> list[str]:
     best = max(forms, key=lambda n: float(forms[n]), default="")
     model = judge.model
     present = {*(judge.run.get("added") or []), *((e.name for e in model.effects) if model is not None else ())}
-    return [best] if best in CATALOGUE and best not in present and float(forms[best]) >= SURE else []
+    refused = {r["law"] for r in judge.taken_back}
+    return [best] if best in CATALOGUE and best not in present | refused and float(forms[best]) >= SURE else []
 
 
 def _adding(judge: Result, names: Sequence[str]) -> list[str]:

@@ -98,6 +98,11 @@ class Result:
         """The folder as it was given, which commands have to be given again; its name for one made in memory."""
         return self.folder or Path(self.name)
 
+    @property
+    def taken_back(self) -> list[dict[str, Any]]:
+        """Contact laws that `improve` has taken back by then: `law`, and a `sentence` that says why, among others."""
+        return ((self.verdict or {}).get("details") or {}).get("taken_back") or []
+
     @functools.cached_property
     def model(self) -> Model | None:
         """The model that was compared; None where it cannot be loaded any more, such as without a user's effect."""

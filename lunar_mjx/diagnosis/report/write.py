@@ -55,6 +55,7 @@ def _verdict(judge: Result, steps: Sequence[Step]) -> list[str]:
     lines = []
     if judge.verdict:
         lines.append(f"Verdict on {judge.name}, {judge.verdict.get('verdict')}: {judge.verdict.get('sentence')}")
+        lines += [str(r["sentence"]) for r in judge.taken_back]
     if len(steps) > 1 and comparable(steps):
         splits, measure = judged(steps)
         first, end = error(steps[0], splits), error(steps[-1], splits)

@@ -15,7 +15,7 @@ from lunar_mjx.diagnosis.report import figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error
-from lunar_mjx.diagnosis.report.write import _audit_line
+from lunar_mjx.diagnosis.report.write import _audit_line, _verdict
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import parameter_table
 from lunar_mjx.inference.coordinates import FACTOR_UNIT, NUISANCE, Coordinate
@@ -75,6 +75,15 @@ def test_what_is_unlisted_is_sought_under_the_better_contact_law(run):
     ]
     alone = result("run1", {"verdict": "UNKNOWN", "port": "soil"})
     assert [s.partition("  ")[0] for s in lead([alone], alone).next] == ["lunar-mjx unknown run1"]
+
+
+def test_a_contact_law_that_was_taken_back_is_told_of_and_not_proposed():
+    refused = [{"law": "stress_integral", "run": "run1", "sentence": "stress_integral was taken back."}]
+    verdict = {"verdict": "KNOWN", "sentence": "side_wall is missing.", "effects": ["side_wall"]}
+    verdict |= {"forms": {"closed form": 1e-9, "stress_integral": 1.0}, "details": {"taken_back": refused}}
+    judge = result("run1", verdict)
+    assert lead([judge], judge).next[0].split()[3] == "side_wall"
+    assert "stress_integral was taken back." in _verdict(judge, [])
 
 
 def test_several_are_added_one_by_one_and_a_better_contact_law_first(run):
