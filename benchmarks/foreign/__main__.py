@@ -128,7 +128,7 @@ def parser() -> argparse.ArgumentParser:
     driven.add_argument("--drives", type=int, default=24)
     driven.add_argument("--seed", type=int, help="as for make")
     driven.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    driven.add_argument("--gpus", type=int, default=0, help="GPUs that the processes share; 0: CPU cores alone")
+    driven.add_argument("--gpus", type=int, default=0, help="visible GPUs that the processes share; 0: cores alone")
     driven.add_argument("--minutes", type=float, default=60.0)
     driven.add_argument("--limit", type=float, default=0.0, help="seconds for one campaign, made and answered; 0: none")
     driven.add_argument("--setting", action="append", default=[], help="NAME=VALUE for `compare`, to ablate a rule")

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -77,4 +80,28 @@ def test_processes_take_gpus_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyP
         campaigns._begin(places, tmp_path, 0.0, 0.0, {})
         seen.append(campaigns.os.environ["CUDA_VISIBLE_DEVICES"])
     assert seen == ["0", "1", "0"]
-    assert {gpu for _, gpu in campaigns.places([{0}, {1}], 0)} == {None}
+
+
+def test_gpus_are_the_first_of_those_that_are_visible() -> None:
+    shares = [{0}, {1}, {2}]
+    assert [gpu for _, gpu in campaigns.places(shares, 2, "5,GPU-8f0c,7")] == ["5", "GPU-8f0c", "5"]
+    for visible, count in (("5", 1), ("", 0)):
+        with pytest.raises(SystemExit, match=f"--gpus 2: CUDA_VISIBLE_DEVICES={visible} lists {count};"):
+            campaigns.places(shares, 2, visible)
+
+
+def test_without_gpus_jax_computes_on_cores_alone() -> None:
+    """A process that has begun imports JAX only then, so that JAX heeds it."""
+    program = """
+import os, pathlib, queue
+from benchmarks.foreign.drives import campaigns
+places = queue.Queue()
+for place in campaigns.places([os.sched_getaffinity(0)], 0, "0,1"):
+    places.put(place)
+campaigns._begin(places, pathlib.Path("."), 0.0, 0.0, {})
+import jax
+print(jax.config.jax_platforms)
+"""
+    chosen = {k: v for k, v in os.environ.items() if k != "JAX_PLATFORMS"}
+    told = subprocess.run([sys.executable, "-c", program], env=chosen, capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["cpu"]

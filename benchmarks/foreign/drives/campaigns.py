@@ -213,7 +213,7 @@ def drives(args: argparse.Namespace) -> None:
     head, dirty = work.commit()
     queue = multiprocessing.get_context("spawn").Queue()
     allowed = sorted(os.sched_getaffinity(0))
-    for place in places(core_shares(allowed, args.processes), args.gpus):
+    for place in places(core_shares(allowed, args.processes), args.gpus, os.environ.get("CUDA_VISIBLE_DEVICES")):
         queue.put(place)
     settings = dict(s.split("=", 1) for s in args.setting)
     processes = pool.Pool(args.processes, _begin, queue, folder, until, args.limit, settings)
@@ -248,9 +248,17 @@ def core_shares(cores: Sequence[int], processes: int) -> list[set[int]]:
     return [{cores[(k * each + i) % len(cores)] for i in range(each)} for k in range(processes)]
 
 
-def places(shares: Sequence[set[int]], gpus: int) -> list[tuple[set[int], str | None]]:
-    """Cores and GPU of each process, by the cores of each: GPUs in turn, or none where there are 0."""
-    return [(cores, str(k % gpus) if gpus else None) for k, cores in enumerate(shares)]
+def places(shares: Sequence[set[int]], gpus: int, visible: str | None = None) -> list[tuple[set[int], str | None]]:
+    """Cores and GPU of each process: GPUs in turn, or none where there are 0.
+
+    Args:
+      shares: cores of each process. gpus: how many are shared, the first of those that are visible.
+      visible: their names as CUDA_VISIBLE_DEVICES lists them, numbers or UUIDs; None: all, by number.
+    """
+    names = [str(k) for k in range(gpus)] if visible is None else [n for n in visible.split(",") if n]
+    if gpus > len(names):
+        raise SystemExit(f"--gpus {gpus}: CUDA_VISIBLE_DEVICES={visible} lists {len(names)}; ask for as many.")
+    return [(cores, names[k % gpus] if gpus else None) for k, cores in enumerate(shares)]
 
 
 def _report(answers: Iterable[tuple[Any, Any]], begun: float) -> None:
@@ -271,8 +279,10 @@ def _begin(queue: Any, folder: Path, until: float, limit_s: float, settings: Map
     # Cores are counted by what a process may use: its own share, so that none makes threads for all.
     cores, gpu = queue.get()
     os.sched_setaffinity(0, cores)
-    if gpu is not None:
-        # before JAX is imported, which else takes the first GPU, and three quarters of its memory
+    # before JAX is imported, which else takes the first GPU, and three quarters of its memory
+    if gpu is None:
+        os.environ["JAX_PLATFORMS"] = "cpu"
+    else:
         os.environ |= {"CUDA_VISIBLE_DEVICES": gpu, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     _Process.folder, _Process.until, _Process.limit_s, _Process.settings = folder, until, limit_s, settings
 
