@@ -277,7 +277,9 @@ class _Process:
 
 def _begin(queue: Any, folder: Path, until: float, limit_s: float, settings: Mapping[str, str]) -> None:
     # Cores are counted by what a process may use: its own share, so that none makes threads for all.
-    cores, gpu = queue.get()
+    cores, gpu = place = queue.get()
+    # Back to the end: where a process dies all are started anew, and take the places in turn again.
+    queue.put(place)
     os.sched_setaffinity(0, cores)
     # before JAX is imported, which else takes the first GPU, and three quarters of its memory
     if gpu is None:
