@@ -29,7 +29,7 @@ class Kind:
     """A kind of hidden effect.
 
     Attributes:
-      draw: amounts. ports: where it acts; the first is where it is written, others take the same change exactly.
+      draw: amounts. ports: where it acts, which take the same change exactly or each a part of it.
       needs: of the table: "angles", "braking", "torque", "speeds", "loads", "gravities", "rear" (contact behind the
         axle), "sinkage", "cohesive" (soil).
       laws: base laws that can hold it.
@@ -151,8 +151,13 @@ OUTSIDE: dict[str, Kind] = {
     "peak_shear": Kind(  # dense sand: a hump of strength at small displacement
         lambda r, b: {"height": _between(r, 0.4, 0.9)}, ("wheel_shear", "soil"), frozenset(), _STRESSES
     ),
-    "rear_lift": Kind(  # soil lifted by the rear of a spinning rim
-        lambda r, b: {"density": _between(r, 3000, 8000)}, ("wheel_normal",), frozenset({"sinkage", "torque"})
+    # Soil lifted by the rear of a spinning rim. Its weight presses the wheel down, as too little normal stress would,
+    # and has a lever about the axle. Normal stress makes no such moment, so that this part acts at the other port. With
+    # base constants refitted either part alone stands out by about half of what both do.
+    "rear_lift": Kind(
+        lambda r, b: {"density": _between(r, 3000, 8000)},
+        ("wheel_normal", "wheel_shear"),
+        frozenset({"sinkage", "torque"}),
     ),
     "bearing_side_load": Kind(  # friction of the axle's bearing under side load
         lambda r, b: {"arm": _between(r, 0.08, 0.2)}, ("wheel_shear", "motor_torque"), _ANGLES | _TORQUE

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.foreign import bed, cases, kinds, told
+from benchmarks.foreign import bed, cases, kinds, told, wheel
 from benchmarks.foreign.laws import granular_stress
 from benchmarks.foreign.misfit import Field
 from benchmarks.foreign.wheel import Rows, World, run
@@ -156,6 +156,23 @@ def test_effects_push_where_the_literature_says(name: str) -> None:
     bare = getattr(run(world("integral"), at), quantity)
     there = getattr(run(world("integral", **{name: amounts}), at), quantity)
     assert sign * (there - bare)[0] > 1e-3 * abs(bare[0])
+
+
+@pytest.mark.parametrize("name", SIGNS)
+def test_a_moment_or_side_force_beside_the_stresses_acts_at_the_port_of_both(name: str, monkeypatch) -> None:
+    """At one sinkage; the load on the wheel and its pull may be told at the port of the normal stress, these cannot."""
+    bare, there = world("integral"), world("integral", **{name: SIGNS[name][0]})
+    at, sunk = rows(slip=(0.4,), angle=(20.0,)), np.array([0.02])
+
+    def change() -> np.ndarray:
+        return np.abs(np.subtract(*(wheel.forces(w, wheel.settle(w, at), sunk) for w in (there, bare))))[:, 0]
+
+    with monkeypatch.context() as stresses_alone:
+        stresses_alone.setattr(wheel, "_more", lambda *given: given[-1])
+        in_stress = change().max() > 0.0
+    _, _, side, torque = change()
+    if not in_stress and max(side, torque) > 0.0:
+        assert "wheel_shear" in {**kinds.KNOWN, **kinds.OUTSIDE}[name].ports
 
 
 def test_skid_shear_counts_the_whole_time_under_a_braked_wheel() -> None:
