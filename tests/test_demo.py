@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
-from lunar_mjx.demo import run_demo
+from lunar_mjx.demo import run_demo, sections
+from lunar_mjx.demo.figures import ROVERS
 from lunar_mjx.errors import UserError
+from lunar_mjx.report.page import write_page
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +84,27 @@ def test_the_page_on_a_phone(made, browser):
     wide = "[...document.querySelectorAll('.wide')].filter(box => box.scrollWidth > box.clientWidth)"
     assert browser.value(f"{wide}.length > 0 && {wide}.every(box => box.tabIndex === 0)")
     assert not browser.problems
+
+
+@pytest.mark.parametrize("rover", ROVERS)
+def test_no_line_breaks_the_name_of_a_rover(rover, tmp_path, browser):
+    name = f"{sections._name(cast(Any, SimpleNamespace(rover=rover)))}s"
+    browser.open(write_page(tmp_path / "page.html", "Names", [f"32 rovers drove: 16 {name} 2.1 m"], []).as_uri())
+    browser.wait("document.body?.dataset.ready")
+    lines = """(name => {
+      const line = document.querySelector(".verdict p"), word = document.createRange();
+      const start = line.textContent.indexOf(name), found = {name: 0, all: 0};
+      word.setStart(line.firstChild, start);
+      word.setEnd(line.firstChild, start + name.length);
+      for (let width = 120; width < 320; width += 2) {
+        line.style.width = `${width}px`;
+        found.name = Math.max(found.name, word.getClientRects().length);
+        found.all = Math.max(found.all, Math.round(line.clientHeight / parseFloat(getComputedStyle(line).lineHeight)));
+      }
+      return found;
+    })"""
+    found = browser.value(f"{lines}({json.dumps(name)})")
+    assert found["all"] > 1 and found["name"] == 1
 
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path):

@@ -118,7 +118,8 @@ def of_finite(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> f
 
 
 def _name(d: Drive) -> str:
-    return ROVERS.get(d.rover, (d.rover, ""))[0]
+    """Name of the rover, as text whose lines do not break it; figures draw names in one line."""
+    return ROVERS.get(d.rover, (d.rover, ""))[0].replace("-", "\N{NON-BREAKING HYPHEN}")
 
 
 def _angles(angles: Sequence[float]) -> str:
