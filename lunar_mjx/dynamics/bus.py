@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from lunar_mjx.dynamics.state import Params, Telemetry
 from lunar_mjx.effects.joint.electrical import sagged_voltage
@@ -32,8 +33,9 @@ def bus_current(seen: Telemetry, params: Params, voltage: Any = None) -> Any:
 
     Args:
       seen: telemetry, (time,) or (batch, time).
-      params: of the drive; those of effects are a number each, or one per joint.
-      voltage: of the bus, V, a number or (time,); by the model's own supply if None.
+      params: of the drive. Those of `bus_droop` are a number or (batch,). The resistance of the harness is a number,
+        (joint,) or (batch, joint); one of each rover is (batch, 1), since (batch,) cannot be told from (joint,).
+      voltage: of the bus, V, a number, (time,) or (batch, time); by the model's own supply if None.
 
     Returns:
       The current at the times of the telemetry; None where nobody knows the voltage.
@@ -46,7 +48,9 @@ def bus_current(seen: Telemetry, params: Params, voltage: Any = None) -> Any:
     power = 0.0 if "motor_power" in params.effects else motors
     harness = params.effects.get("harness_resistance")
     if harness is not None:
-        power = power + jnp.sum(harness["resistance"] * seen.current**2, axis=-1)
+        resistance = harness["resistance"]
+        resistance = resistance[..., None, :] if np.ndim(resistance) > 1 else resistance
+        power = power + jnp.sum(resistance * seen.current**2, axis=-1)
     supply = seen.supply
     if supply is not None and supply.load is not None and supply.solar is not None:
         power = power + supply.load - supply.solar
@@ -58,4 +62,7 @@ def _own_voltage(seen: Telemetry, params: Params, motors: Any) -> Any:
     if seen.supply is not None and seen.supply.voltage is not None:
         return seen.supply.voltage
     droop = params.effects.get("bus_droop")
-    return None if droop is None else sagged_voltage(SimpleNamespace(**droop), motors)
+    if droop is None:
+        return None
+    over_time = {k: v[..., None] if np.ndim(v) else v for k, v in droop.items()}
+    return sagged_voltage(SimpleNamespace(**over_time), motors)

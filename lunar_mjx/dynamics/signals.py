@@ -104,12 +104,13 @@ def observe(
     Args:
       system: whose rover it is.
       telemetry: of `rollout` (time, ...) or `rollout_batch` (batch, time, ...).
-      params: the parameters of the drive, for gravity (a number, or one per rover); those of the model if None.
+      params: the parameters of the drive, for gravity (a number, or one per rover) and the current of the bus (see
+        `bus.bus_current`); those of the model if None.
       imu_position: of the accelerometer in the chassis frame, m; the frame's origin if None.
       imu_quaternion: w, x, y, z from the IMU's axes to the chassis's, for the channels of gyroscope and accelerometer;
         the same axes if None.
-      bus_voltage: by which the current of the bus is told, V, a number or (time,); the model's own if None. Where
-        neither is known there is no channel bus_current_A.
+      bus_voltage: by which the current of the bus is told, V, a number, (time,) or (batch, time); the model's own if
+        None. Where neither is known there is no channel bus_current_A.
 
     Returns:
       Channels of shape (time,) or (batch, time), named as in a log.

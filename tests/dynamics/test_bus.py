@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
 
-from lunar_mjx.dynamics.bus import tells_bus_voltage
+from lunar_mjx.dynamics.bus import BUS_CURRENT, tells_bus_voltage
 from lunar_mjx.dynamics.signals import observe
-from lunar_mjx.dynamics.state import Supply
+from lunar_mjx.dynamics.state import Supply, Telemetry
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.rover import load_rover
@@ -58,3 +61,29 @@ def test_a_model_with_a_supply_needs_no_voltage_from_elsewhere() -> None:
     expected = (POWER + of_others) / [30.0, 20.0]
     assert channels(supply=supply)["bus_current_A"] == pytest.approx(expected, rel=1e-12), "electronics alone"
     assert tells_bus_voltage(("motor", "battery")) and not tells_bus_voltage(("motor", "electronics"))
+
+
+def test_rovers_of_a_batch_have_a_bus_and_a_harness_of_their_own() -> None:
+    """As many rovers as times: a resistance of each rover is none of each time."""
+    droop, harness = catalogue.get("bus_droop"), catalogue.get("harness_resistance")
+    system = system_of(load_rover("luvmi_x"), droop, harness)
+    own = [
+        {"bus_droop": {"resistance": r, "voltage": v}, "harness_resistance": {"resistance": np.linspace(r, 2 * r, 12)}}
+        for r, v in ((0.1, 48.0), (0.4, 24.0))
+    ]
+    drives = [telemetry(TIMES, current=CURRENT * k, voltage=VOLTAGE) for k in (1.0, 0.5)]
+
+    def drawn(seen: Telemetry, effects: dict) -> np.ndarray:
+        params = dataclasses.replace(system.params, effects=effects)
+        return np.asarray(observe(system, seen, params).channels[BUS_CURRENT])
+
+    def stacked(trees: list) -> Any:
+        return jax.tree.map(lambda *each: np.stack(each), *trees)
+
+    with jax.enable_x64(True):
+        alone = [drawn(seen, effects) for seen, effects in zip(drives, own, strict=True)]
+        np.testing.assert_allclose(drawn(stacked(drives), stacked(own)), alone, rtol=1e-12)
+        shared = own[0]["harness_resistance"]
+        alone = [drawn(seen, {**p, "harness_resistance": shared}) for seen, p in zip(drives, own, strict=True)]
+        found = drawn(stacked(drives), {**stacked(own), "harness_resistance": shared})
+        np.testing.assert_allclose(found, alone, rtol=1e-12)
