@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.linalg import lapack
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,6 +33,33 @@ class Chain:
         lagged = np.empty_like(out)
         lagged[self.order] = out
         return lagged
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class KalmanFilter:
+    """The filter of a series with a white noise and a slow one; it depends on their sizes alone, not on what is read.
+
+    Attributes:
+      variance: (n,) of every innovation.
+      decay: (n,) share of the slow noise's mean that is left from the time before. gain: (n,) of the filter.
+    """
+
+    variance: np.ndarray
+    decay: np.ndarray
+    gain: np.ndarray
+
+    def innovations(self, columns: np.ndarray) -> np.ndarray:
+        """What each reading (n, k) adds to those before it, over its standard deviation."""
+        if not columns.shape[1]:  # LAPACK's wrapper writes beyond an array without columns
+            return np.zeros(columns.shape)
+        # The slow noise's mean before a reading is a share of the one before and of that reading. All of them solve one
+        # system with two diagonals: a loop over time would go through all columns at every time.
+        bands = np.ones((2, len(columns)))
+        bands[1, :-1] = -self.decay[1:] * (1.0 - self.gain[:-1])
+        told = np.zeros(columns.shape, order="F")
+        told[1:] = (self.decay[1:] * self.gain[:-1])[:, None] * columns[:-1]
+        mean, _ = lapack.dtbtrs(bands, told, uplo="L", diag="U", overwrite_b=True)
+        return np.asarray((columns - mean) / np.sqrt(self.variance)[:, None])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,17 +152,20 @@ class Observations:
                 out[part] = flat[part] / np.sqrt(np.square(s.white) + s.coloured**2).reshape(-1, 1)
                 if s.chain is not None:
                     out[part] = s.chain.whiten(out[part])
-        for group in self._clocks():
-            _innovations(group, flat, out)
+        for s, kalman in self._filters:
+            part = slice(s.start, s.stop)
+            out[part] = kalman.innovations(flat[part])
         return out.reshape(columns.shape)
 
-    def _clocks(self) -> list[list[Series]]:
-        """Series with slow noise by their clock: they share the filter's loop over time, which is what costs."""
-        batches: dict[tuple[int, bytes], list[Series]] = {}
+    @functools.cached_property
+    def _filters(self) -> list[tuple[Series, KalmanFilter]]:
+        """Series with slow noise, and the filters that whiten them."""
+        # series of one clock share the loop over its times, which is what costs
+        clocks: dict[tuple[int, bytes], list[Series]] = {}
         for s in self.series:
             if _is_slow(s):
-                batches.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
-        return list(batches.values())
+                clocks.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
+        return [found for group in clocks.values() for found in zip(group, _kalman_filters(group), strict=True)]
 
     def log_widths(self) -> np.ndarray:
         """(n,) log of what `whiten` divides every innovation by, in the channels' units.
@@ -145,9 +176,8 @@ class Observations:
         for s in self.series:
             if not _is_slow(s):
                 out[s.start : s.stop] = 0.5 * np.log(np.square(s.white) + s.coloured**2)
-        for group in self._clocks():
-            for i, (total, _, _) in enumerate(_filter(group)):
-                out[[s.start + i for s in group]] = 0.5 * np.log(total)
+        for s, kalman in self._filters:
+            out[s.start : s.stop] = 0.5 * np.log(kalman.variance)
         return out
 
     def slow_variance(self) -> np.ndarray:
@@ -159,9 +189,8 @@ class Observations:
         for s in self.series:
             if not _is_slow(s):
                 out[s.start : s.stop] = s.coloured**2
-        for group in self._clocks():
-            for i, (total, _, gain) in enumerate(_filter(group)):
-                out[[s.start + i for s in group]] = gain * total
+        for s, kalman in self._filters:
+            out[s.start : s.stop] = kalman.gain * kalman.variance
         return out
 
 
@@ -170,34 +199,18 @@ def _is_slow(s: Series) -> bool:
     return s.time is not None and s.coloured > 0.0 and s.correlation_time > 0.0
 
 
-def _filter(group: Sequence[Series]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Variance (series,) of every innovation, share (series,) of the slow noise's mean that is left from the time
-    before, and the filter's gain (series,), time by time: none of them depends on what was measured."""
+def _kalman_filters(group: Sequence[Series]) -> list[KalmanFilter]:
+    """Filters of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""
     time = np.asarray(group[0].time)
     white = np.stack([np.broadcast_to(np.square(s.white), time.shape) for s in group], axis=1)
     power = np.array([s.coloured**2 for s in group])
-    tau = np.array([s.correlation_time for s in group])
+    decay = np.exp(-np.diff(time, prepend=time[0])[:, None] / np.array([s.correlation_time for s in group]))
+    total, gain = np.empty_like(white), np.empty_like(white)
     # The process begins in its stationary state: nothing is known of its past.
-    variance, decay = power.copy(), np.ones(len(group))
+    variance = power
     for i in range(len(time)):
-        if i:
-            decay = np.exp(-(time[i] - time[i - 1]) / tau)
-            variance = decay**2 * variance + power * (1.0 - decay**2)
-        total = variance + white[i]
-        gain = variance / total
-        yield total, decay, gain
-        variance = (1.0 - gain) * variance
-
-
-def _innovations(group: Sequence[Series], flat: np.ndarray, out: np.ndarray) -> None:
-    """Kalman filter of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""
-    data = np.stack([flat[s.start : s.stop] for s in group], axis=1)  # (time, series, column)
-    result = np.empty_like(data, dtype=float)
-    mean = np.zeros_like(data[0], dtype=float)
-    for i, (total, decay, gain) in enumerate(_filter(group)):
-        mean = decay[:, None] * mean
-        innovation = data[i] - mean
-        result[i] = innovation / np.sqrt(total)[:, None]
-        mean = mean + gain[:, None] * innovation
-    for j, s in enumerate(group):
-        out[s.start : s.stop] = result[:, j]
+        variance = decay[i] ** 2 * variance + power * (1.0 - decay[i] ** 2)
+        total[i] = variance + white[i]
+        gain[i] = variance / total[i]
+        variance = (1.0 - gain[i]) * variance
+    return [KalmanFilter(total[:, k], decay[:, k], gain[:, k]) for k in range(len(group))]
