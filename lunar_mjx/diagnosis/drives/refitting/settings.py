@@ -38,6 +38,8 @@ class DriveRefit:
     most_looks: int = 2
     """Jacobians of one place at most: a second has steps that fit what the first has found, a third would see the
     same."""
+    most_learnt: int = 8
+    """Steps of EM at one place at most, by which errors of single readings are learnt."""
     most_idle: int = 1
     """Places without a gain that are borne in a row: smaller errors promise more of the same slopes, so that one may
     lie on the way."""
