@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import get_lapack_funcs
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +58,8 @@ class KalmanFilter:
         bands[1, :-1] = -self.decay[1:] * (1.0 - self.gain[:-1])
         told = np.zeros(columns.shape, order="F")
         told[1:] = (self.decay[1:] * self.gain[:-1])[:, None] * columns[:-1]
-        mean, _ = lapack.dtbtrs(bands, told, uplo="L", diag="U", overwrite_b=True)
+        (solve,) = get_lapack_funcs(("tbtrs",), (bands, told))
+        mean, _ = solve(bands, told, uplo="L", diag="U", overwrite_b=True)
         return np.asarray((columns - mean) / np.sqrt(self.variance)[:, None])
 
 

@@ -48,6 +48,12 @@ def test_series_of_equal_times_are_whitened_as_if_alone():
     np.testing.assert_allclose(both.whiten(data)[40:], one.whiten(data[40:]), rtol=1e-12)
 
 
+def test_nothing_is_whitened_to_nothing():
+    """LAPACK's wrapper would write beyond an array without columns."""
+    o = manoeuvres(2, 40, coloured=COLOURED, correlation_time=TAU)
+    assert o.whiten(np.zeros((80, 0))).shape == (80, 0)
+
+
 def test_points_of_a_table_have_noise_of_their_own():
     o = manoeuvres(1, 4)
     std = np.array([1.0, 2.0, 4.0, 8.0])

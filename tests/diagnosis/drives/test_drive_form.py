@@ -665,7 +665,8 @@ def test_readings_that_are_far_off_have_errors_of_their_own():
     without = plain.refit(frozenset(), None, None)
     # where readings do not jump, the same noise leads to
     calm = DriveForm(Toy({"a": 1.5, "b": -0.8}), DriveSettings()).refit(frozenset(), None, None)  # type: ignore[arg-type]
-    assert abs(base.u[1] - calm.u[1]) < 0.06
+    # (0.05 off where errors were learnt by one step for each Jacobian, and 0.2 where they settled once)
+    assert np.max(np.abs(base.u[:2] - calm.u[:2])) < 0.02
 
     def usual_width(form, refit):
         noise = refit.linear.evidence(frozenset())[1].noise[form._errors.group]

@@ -116,6 +116,10 @@ class ErrorModel:
         self.present = Errors(observations)
         self._take(self._channel_errors().usual)
 
+    def forget_single(self) -> None:
+        """Begins anew with single readings that have no errors of their own."""
+        self.present = dataclasses.replace(self.present, single=0.0, log_ratio=0.0)
+
     def hold(self, observations: Observations, errors: Errors) -> None:
         """Takes errors that another model has found, those of channels for good.
 

@@ -24,6 +24,11 @@ from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress
 
+SETTLES, ANEW, SETTLES_AGAIN, ENDS = range(4)
+"""Stages of a refit, each of which begins at the best place so far: errors of single readings settle at every place;
+they are learnt anew, from none, by a step of EM for each place, as what they settle at depends on where they began;
+they settle again; a descent ends what the errors of the best place leave to gain."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Base:
@@ -127,8 +132,9 @@ class OwnRefit:
     def approach(self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool) -> tuple[np.ndarray, Sizes]:
         """Where (coordinates,) the evidence of the model as it is is highest, and sizes of there; errors are learnt.
 
-        They are learnt anew at every Jacobian: at a poor place they are large, and a descent that kept them would end
-        there. The time may end it wherever it has come; errors are those of the place in the end.
+        They are learnt at every Jacobian: at a poor place they are large, and a descent that kept them would end there.
+        What a refit leaves to gain goes to whatever is refitted next: see `SETTLES` for how it is led on. The time may
+        end it wherever it has come; errors are those of the place in the end.
 
         Args:
           u: where from. free: places of what moves. begun: sizes that were found near there, or None.
@@ -138,9 +144,9 @@ class OwnRefit:
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at.
         """
-        settings, damping, idle, looks, ended = self.settings, DRIVE_REFIT.damping, 0, 0, False
+        settings, damping, idle, looks, stage = self.settings, DRIVE_REFIT.damping, 0, 0, SETTLES
         ground, sizes = HeldOutGround(self.drives, self.design, self.prior, self.errors), begun
-        best: tuple[float, np.ndarray, Errors, Sizes] | None = None
+        best: tuple[float, np.ndarray, Errors, Sizes, np.ndarray] | None = None
         slopes = np.zeros((0, 0))
         try:
             for _ in range(settings.most_steps):
@@ -148,37 +154,42 @@ class OwnRefit:
                 if looks < DRIVE_REFIT.most_looks:
                     slopes = self.signatures.look(u, free)
                 looks += 1
-                learnt, sizes = self.settle(u, free, slopes, sizes, learns)
+                learnt, sizes = self.settle(u, free, slopes, sizes, learns and stage != ANEW)
                 inputs = self.prior.places.inputs(free, slopes)
                 cost = self.descent.cost(u, free, sizes, inputs)
                 # what slopes promise has not been reached yet
                 value = learnt.log_evidence - 0.5 * self.descent.promise(cost, u, free, slopes)
                 gained = math.inf if best is None else value - best[0]
                 if best is None or gained > 0.0:
-                    best = value, u, self.errors.present, sizes
+                    best = value, u, self.errors.present, sizes, slopes
                 # Smaller errors promise more of the same slopes: one place without a gain may lie on the way.
                 idle = idle + 1 if gained < 0.5 * settings.settled else 0
-                ended = ended and idle > 0
+                stage = SETTLES_AGAIN if stage == ENDS and not idle else stage
                 self.progress("refitting the model as it is", math.nan)
                 if idle <= DRIVE_REFIT.most_idle:
                     there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
                     damping = min(there.damping, DRIVE_REFIT.renewed_damping)
                     looks = looks if there.gained == 0.0 else 0
                     u = ground.mapped(there.u, u, slopes, free, sizes)
-                elif not ended:
-                    # What errors of the best place leave to gain goes to whatever is refitted next, if it is not taken
-                    # here: a step for each of them had left a Husky's refit 3,500 nats.
-                    _, u, self.errors.present, sizes = best
-                    u, slopes = self.descent.descend(u, free, sizes, inputs)
-                    u, looks, ended = ground.mapped(u, u, slopes, free, sizes), 0, True
-                else:
+                    if learns and stage == ANEW:
+                        self.errors.learn_single(learnt)
+                    continue
+                if stage == ENDS:
                     break
+                (_, u, self.errors.present, sizes, slopes), idle, stage = best, 0, stage + 1
+                looks = DRIVE_REFIT.most_looks  # its derivatives are known
+                self.drives.about(u)
+                if stage == ANEW and learns:
+                    self.errors.forget_single()
+                elif stage == ENDS:
+                    u, slopes = self.descent.descend(u, free, sizes, self.prior.places.inputs(free, slopes), slopes)
+                    u, looks = ground.mapped(u, u, slopes, free, sizes), 0
         # A place of which nothing can be told is not gone to; the best one before it stands.
         except (EvidenceError, TimeUp):
             if best is None:
                 raise
         assert best is not None
-        _, u, self.errors.present, sizes = best
+        _, u, self.errors.present, sizes, _ = best
         return u, sizes
 
     def settle(
