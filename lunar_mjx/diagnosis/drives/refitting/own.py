@@ -198,7 +198,7 @@ class OwnRefit:
         """What the model as it is tells of errors at a place once these have settled; see `learn`.
 
         Errors of single readings are learnt by steps of EM, each of which shows others what they hide. One step for
-        each Jacobian was what refits waited for: two foreign Huskies ended 340 and 6,800 nats below where they end now.
+        each Jacobian was what refits waited for: two foreign Huskies ended 340 and 6,000 nats below where they end now.
 
         Args:
           u, free, slopes, begun: as for `learn`. learns: whether errors of single readings are learnt.
