@@ -171,15 +171,15 @@ class OwnRefit:
                     damping = min(there.damping, DRIVE_REFIT.renewed_damping)
                     looks = looks if there.gained == 0.0 else 0
                     u = ground.mapped(there.u, u, slopes, free, sizes)
-                    if learns and stage == ANEW:
+                    if stage == ANEW:
                         self.errors.learn_single(learnt)
                     continue
                 if stage == ENDS:
                     break
-                (_, u, self.errors.present, sizes, slopes), idle, stage = best, 0, stage + 1
+                (_, u, self.errors.present, sizes, slopes), idle, stage = best, 0, stage + 1 if learns else ENDS
                 looks = DRIVE_REFIT.most_looks  # its derivatives are known
                 self.drives.about(u)
-                if stage == ANEW and learns:
+                if stage == ANEW:
                     self.errors.forget_single()
                 elif stage == ENDS:
                     u, slopes = self.descent.descend(u, free, sizes, self.prior.places.inputs(free, slopes), slopes)
