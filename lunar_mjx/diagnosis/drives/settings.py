@@ -58,8 +58,8 @@ class DriveSettings(SearchSettings):
     most_rounds: int = 2
     """1; rounds of refit and re-linearisation."""
     most_steps: int = 30
-    """1; Jacobians of the model as it is, at each of which errors are learnt anew. Refits of foreign drives settled
-    after 13 to 18; one that the count ends is hundreds of nats short, which go to whatever is refitted next."""
+    """1; places of a refit of the model as it is at most, at each of which errors are learnt. Fifteen had ended it
+    hundreds of nats short, which go to whatever is refitted next."""
     most_jacobians: int = 5
     """1; Jacobians of one descent."""
     settled: float = 2.0

@@ -198,10 +198,10 @@ class OwnRefit:
         """What the model as it is tells of errors at a place once these have settled; see `learn`.
 
         Errors of single readings are learnt by steps of EM, each of which shows others what they hide. One step for
-        each Jacobian was what refits waited for: two foreign Huskies ended 340 and 6,000 nats below where they end now.
+        each Jacobian was what refits waited for: that of a foreign Husky ended 345 nats below where it ends now.
 
         Args:
-          u, free, slopes, begun: as for `learn`. learns: whether errors of single readings are learnt.
+          u, free, slopes, begun: as for `learn`. learns: whether errors of single readings settle.
         """
         learnt, sizes = self.learn(u, free, slopes, begun)
         for _ in range(DRIVE_REFIT.most_learnt if learns else 0):
