@@ -137,7 +137,7 @@ def test_exact_at_any_time_step(dt: float) -> None:
     new, _, _ = step(dt, v_x, v_y, rim, start)
     half, _, _ = step(dt / 2, v_x, v_y, rim, start)
     twice, _, _ = step(dt / 2, v_x, v_y, rim, half)
-    steps = max(200, int(200 * dt * 0.5 / LENGTH))
+    steps = max(200, int(100 * dt * 0.5 / LENGTH))
     for name, speed in (("slip_x", rim - v_x), ("direction", lean)):
         exact = ref.rolling_state(start[name], speed, fastest, LENGTH, dt, steps)
         assert new[name] == pytest.approx(exact, rel=1e-9, abs=1e-9)
