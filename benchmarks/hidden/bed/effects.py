@@ -81,7 +81,9 @@ def _bulldozing(p: Numbers, r: float) -> Hidden:
         ahead = np.clip(1.0 - v["slip"], -1.0, 1.0)
         v["fx"] = v["fx"] - p["front"] * v["b"] * _wall(v, weight, z, z**2) * ahead
         length = v["r"] * np.sin(np.minimum(v["theta_1"], 0.5 * np.pi))
-        j = v["r"] * (v["theta_1"] - v["theta_m"]) * v["lateral"]
+        # soil beside the wheel passes at its travel, however fast the rim turns; the flank's centroid is 3/8 ahead
+        passed = np.maximum(v["rim"], np.abs(v["v_x"])) / np.maximum(np.abs(v["v_x"]), 1e-9)
+        j = 0.625 * length * passed * v["lateral"]
         moved = -np.sign(j) * np.expm1(-np.abs(j) / v["modulus_y"])
         v["fy"] = v["fy"] - p["side"] * length * _wall(v, weight, 2.0 / 3.0 * z, 8.0 / 15.0 * z**2) * moved
 
