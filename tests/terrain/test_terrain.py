@@ -20,6 +20,7 @@ from lunar_mjx.terrain import (
     inclined,
     inside,
     load_terrain,
+    make_surface,
     nearest_rock,
     rock_fraction,
     sample,
@@ -61,15 +62,29 @@ def test_shipped_terrains_load_at_true_scale():
     assert float(slope(load_terrain("slope:-7.5deg").field, 0.5, 0.5)) == pytest.approx(np.radians(7.5), rel=1e-4)
 
 
-def test_stand_in_has_the_statistics_of_the_site():
+@pytest.fixture(scope="module")
+def surface_once():
+    """`make_surface` that makes the ten million heights of the stand-in once for all tests of this file."""
+    kept = {}
+
+    def make(*given, **named):
+        key = repr((given, sorted(named.items())))
+        if key not in kept:
+            kept[key] = make_surface(*given, **named)
+        return kept[key]
+
+    yield make
+    assert len(kept) == 1, "tests ask for one and the same surface"
+
+
+def test_stand_in_has_the_statistics_of_the_site(surface_once):
     from lunar_mjx.resources import find
     from lunar_mjx.terrain.config import read_config
-    from lunar_mjx.terrain.procedural import make_surface
     from lunar_mjx.terrain.roughness import hurst_exponent
 
     table = read_config(find("terrain", "de_gerlache_rim", "terrain.toml") / "terrain.toml").surface
     assert table is not None
-    dem = make_surface(
+    dem = surface_once(
         table.width,
         table.height,
         table.cell,
@@ -101,7 +116,8 @@ def site(tmp_path):
     return path
 
 
-def test_the_stand_in_says_that_it_is_one(caplog):
+def test_the_stand_in_says_that_it_is_one(caplog, surface_once, monkeypatch):
+    monkeypatch.setattr("lunar_mjx.terrain.load.make_surface", surface_once)
     terrain = load_terrain("de_gerlache_rim")
     assert terrain.name == "de_gerlache_rim (stand-in)" and "LUNAR_MJX_DEM_DE_GERLACHE_RIM" in caplog.text
     assert terrain.origin[0] == pytest.approx(-37300, abs=3) and min(terrain.field.heights.shape) > 490
