@@ -18,9 +18,12 @@ def replacing(path: str | Path) -> Iterator[Path]:
     process that is killed, leaves `path` as it was.
 
     Raises:
-      UserError: the operating system refuses: no such folder, no permission, disk full.
+      UserError: the operating system refuses: no such folder, no permission, disk full; or `path` is a folder by its
+        name alone, such as / or nothing.
     """
     path = Path(path)
+    if not path.name:
+        raise UserError(f"{path}: is a folder and no file; name a file in it, as in {path / 'out'}.")
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         try:

@@ -297,6 +297,13 @@ def test_the_command_tells_a_full_disk_in_one_sentence(run, tmp_path):
     assert out.read_text() == "old"
 
 
+@pytest.mark.parametrize("name", ["/", ".", ""])
+def test_a_folder_by_its_name_is_refused_in_one_sentence(name):
+    told = r"^(/|\.): is a folder and no file; name a file in it, as in /?out\.$"
+    with pytest.raises(UserError, match=told), replacing(name):
+        pytest.fail("nothing is written")
+
+
 WRITERS = {
     "write_text",
     "write_bytes",
