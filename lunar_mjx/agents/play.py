@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from lunar_mjx.agents.policy import load_policy, shipped_policies, shipped_policy, taught_in
 from lunar_mjx.cameras.chase import Chase, tracks_of
-from lunar_mjx.cameras.dust import Dust, wheel_motion
+from lunar_mjx.cameras.dust.recorded import Dust, wheel_motion
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs import TASKS, NavigationEnv, make, make_agent, split_keys
 from lunar_mjx.envs.core import PER_STEP

@@ -236,18 +236,5 @@ def _exposed(bright: Any, light: Light, camera: Pinhole, to_sun: Any, key: Any) 
     """From I/F to what a screen shows: optics, exposure, noise, gamma."""
     film = light.film
     value = bright * film.gain(light.soil, to_sun[2])
-    if film.vignetting:
-        # cos^4 of the angle to the optical axis; rays have length 1 along it
-        rays = camera.rays()
-        value = value * jnp.asarray(1.0 / np.sum(rays**2, axis=-1, keepdims=True) ** 2, value.dtype)
-    if film.dust > 0.0:
-        # Dust on the lens spreads light over the whole picture: a veil of the picture's own mean.
-        veil = jnp.mean(value, axis=(-3, -2), keepdims=True)
-        value = (1.0 - film.dust) * value + film.dust * veil
-    if key is not None and film.full_well > 0.0:
-        electrons = film.full_well * jnp.maximum(value, 0.0)
-        # Shot noise is the root of the electrons; read noise adds by its square.
-        spread = jnp.sqrt(electrons + film.read_noise**2) / film.full_well
-        value = value + spread * jax.random.normal(key, value.shape, value.dtype)
-    # Clipped before gamma, as a sensor saturates in light and not on the screen.
-    return jnp.clip(value, 0.0, 1.0) ** (1.0 / film.gamma)
+    chance = None if key is None else jax.random.normal(key, value.shape, value.dtype)
+    return film.developed(value, camera.rays(), chance)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.cameras.camera import RoverCamera
-from lunar_mjx.cameras.dust import Grains, wheel_motion
+from lunar_mjx.cameras.dust.grains import Grains
+from lunar_mjx.cameras.dust.recorded import wheel_motion
 from lunar_mjx.cameras.gl import Post
 from lunar_mjx.cameras.ground_map import MAP_COLOURS
 from lunar_mjx.cameras.pinhole import Pinhole, look_at

@@ -60,7 +60,10 @@ class Lens:
 
     def distorted(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Where points (x, y) are seen: all right and down of the axis, over the depth, of any one shape."""
-        x, y = np.asarray(x, float), np.asarray(y, float)
+        return self.bent(np.asarray(x, float), np.asarray(y, float))
+
+    def bent(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """`distorted` of arrays as they are, of NumPy or of JAX."""
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         return (

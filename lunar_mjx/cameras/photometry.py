@@ -12,6 +12,7 @@ import math
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from lunar_mjx.errors import bad_input, require_finite
 
@@ -131,6 +132,33 @@ class Film:
             raise bad_input("film", "dust", self.dust, "is outside [0, 1)", "give a share, such as 0.05")
         if self.exposure is not None and not require_finite("film", "exposure", self.exposure) > 0.0:
             raise bad_input("film", "exposure", self.exposure, "is not positive", "give about 3, or leave it out")
+
+    @property
+    def plain(self) -> bool:
+        """Whether the camera adds nothing to what light says: as MuJoCo's renderer draws."""
+        return self == Film()
+
+    def developed(self, value: Any, rays: Any, chance: Any = None) -> Any:
+        """What a screen shows of light, 0 to 1: through optics and dust on the lens, onto a sensor with noise.
+
+        Args:
+          value: (..., height, width, 3) light on the sensor, of which 1 saturates it; see `gain`.
+          rays: (height, width, 3) of the pixels, of length 1 along the optical axis; see `Pinhole.rays`.
+          chance: normal numbers of the shape of `value`, by which noise falls; no noise if None.
+        """
+        if self.vignetting:
+            # cos^4 of the angle to the optical axis
+            value = value * jnp.asarray(1.0 / np.sum(rays**2, axis=-1, keepdims=True) ** 2, value.dtype)
+        if self.dust > 0.0:
+            # Dust on the lens spreads light over the whole picture: a veil of the picture's own mean.
+            veil = jnp.mean(value, axis=(-3, -2), keepdims=True)
+            value = (1.0 - self.dust) * value + self.dust * veil
+        if chance is not None and self.full_well > 0.0:
+            electrons = self.full_well * jnp.maximum(value, 0.0)
+            # Shot noise is the root of the electrons; read noise adds by its square.
+            value = value + jnp.sqrt(electrons + self.read_noise**2) / self.full_well * chance
+        # Clipped before gamma, as a sensor saturates in light and not on the screen.
+        return jnp.clip(value, 0.0, 1.0) ** (1.0 / self.gamma)
 
     def gain(self, soil: Regolith, sun_height: Any) -> Any:
         """Display value of I/F = 1; `sun_height` is the sine of the Sun's elevation."""

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.cameras.chase import Chase, tracks_of
-from lunar_mjx.cameras.dust import Dust, Grains, WheelMotion, wheel_motion
+from lunar_mjx.cameras.dust.grains import Grains, WheelMotion
+from lunar_mjx.cameras.dust.recorded import Dust, wheel_motion
 from lunar_mjx.cameras.ground_map import GroundMap
 from lunar_mjx.envs.core import State
 from lunar_mjx.envs.navigation.env import NavigationEnv

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 
 from lunar_mjx.cameras.chase import tracks_of
-from lunar_mjx.cameras.dust import Dust, WheelMotion, wheel_motion
+from lunar_mjx.cameras.dust.grains import WheelMotion
+from lunar_mjx.cameras.dust.recorded import Dust, wheel_motion
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError, bad_input, one_line

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lunar_mjx.cameras import Dust, Pinhole, RoverCamera, Sun, look_at, project, wheel_motion
-from lunar_mjx.cameras.dust import SPRAY, Grains, WheelMotion, sunlit, veiled
+from lunar_mjx.cameras import Dust, Pinhole, Regolith, RoverCamera, Sun, look_at, project, wheel_motion
+from lunar_mjx.cameras.dust.grains import SPRAY, Grains, WheelMotion
+from lunar_mjx.cameras.dust.veil import sunlit, veiled
 from lunar_mjx.rover import Rover, load_rover
 from lunar_mjx.terrain import flat, inclined
 from lunar_mjx.terrain.soil.maps import SoilMap
@@ -165,17 +166,19 @@ def one_grain(area: float = 4e-4, away: float = 3.0) -> Grains:
 
 def test_a_grain_takes_as_much_light_as_its_cross_section_and_only_from_what_is_behind() -> None:
     eye, pose, sun = Pinhole(60, 40, 20.0), look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), np.array([-0.8, 0.0, 0.6])
-    white, far = np.full((40, 60, 3), 255, np.uint8), np.full((40, 60), 9.0)
+    white, far, gain = np.ones((40, 60, 3)), np.full((40, 60), 9.0), 5.0
     grain = one_grain()
-    dark = veiled(white, far, pose, eye, grain, np.array([False]), sun)
-    taken = -2.2 * np.log(dark[..., 0] / 255.0)
+    dark = veiled(white, far, pose, eye, grain, np.array([False]), sun, gain)
+    taken = -np.log(dark[..., 0])
     assert taken.sum() == pytest.approx(grain.area[0] * (eye.focal / 3.0) ** 2, rel=0.08)
     assert taken.max() == taken[20, 30] and (taken[:10] == 0.0).all()
-    assert (veiled(white, np.full((40, 60), 2.0), pose, eye, grain, np.array([True]), sun) == white).all()
+    assert (veiled(white, np.full((40, 60), 2.0), pose, eye, grain, np.array([True]), sun, gain) == white).all()
     black = np.zeros_like(white)
-    assert (veiled(black, far, pose, eye, grain, np.array([False]), sun) == black).all()
-    bright = veiled(black, far, pose, eye, one_grain(1.0), np.array([True]), sun)
-    assert 60 < bright[20, 30, 0] <= 255 and bright[20, 30, 0] >= bright[20, 30, 2]
+    assert (veiled(black, far, pose, eye, grain, np.array([False]), sun, gain) == black).all()
+    bright = veiled(black, far, pose, eye, one_grain(1.0), np.array([True]), sun, gain)
+    # thick: as bright as a cloud of the grains, by the phase angle of the ray there
+    assert bright[20, 30, 0] == pytest.approx(gain * float(Regolith().cloud(0.8)), rel=0.02)
+    assert bright[20, 30, 0] >= bright[20, 30, 2]
 
 
 def test_pictures_differ_near_the_wheels_alone(opengl: tuple[str, ...]) -> None:

@@ -12,16 +12,22 @@ import pytest
 from camera_scene import EYE, bumpy
 
 from lunar_mjx.cameras import (
+    Film,
     Lens,
+    Light,
     Pinhole,
     Pose,
     RoverCamera,
+    Sun,
     depth_image,
     facing,
     lens_of,
     look_at,
+    picture,
     pictures,
+    placed,
     project,
+    rover_shapes,
     stereo,
 )
 from lunar_mjx.cameras.rays import trace
@@ -172,7 +178,6 @@ def test_a_radial_lens_is_refused_just_where_its_radius_no_longer_grows() -> Non
         (lambda: lens_of([0.0] * 8), ("plumb_bob",)),
         (lambda: NavigationConfig(camera_lens=(-0.5, 0, 0, 0, 0)), ("k1 = -0.5", "folds")),
         (lambda: NavigationConfig(camera_lens="wide"), ("navigation: camera_lens = 'wide'", "plumb_bob")),
-        (lambda: RoverCamera(load_rover("luvmi_x"), flat(20.0), camera=WIDE), ("lens = Lens(", "OpenGL", "in JAX")),
     ],
 )
 def test_mistakes_are_one_sentence(make, words: tuple[str, ...]) -> None:
@@ -188,7 +193,48 @@ def test_no_lens_is_none_however_it_is_written() -> None:
     assert NavigationConfig(camera_lens=[0.1, 0, 0, 0, 0]).camera.lens == Lens(0.1)
 
 
-def test_opengl_says_that_it_has_no_lens(scene) -> None:
+FILM = Film(exposure=4.0, vignetting=True, dust=0.1)
+
+
+@pytest.mark.parametrize("lens", [BARREL, Lens(0.25, p1=0.02)], ids=["barrel", "cushion"])
+def test_opengl_and_jax_show_the_same_through_a_lens(opengl: tuple[str, ...], lens: Lens) -> None:
+    """Labels, depth and light of one scene, with a film of its own."""
+    rover, camera, sun = load_rover("luvmi_x"), Pinhole(160, 120, lens=lens), Sun(90.0, 30.0)
+    qpos = rover.compile().qpos0.copy()
+    qpos[:3] = 0.0, 0.0, 0.3
+    pose = look_at(np.array([-1.6, -1.8, 1.6]), np.array([0.3, 0.0, 0.3]))
+    with RoverCamera(rover, bumpy(), camera=camera, sun=sun, film=FILM, largest=(8, 8), backends=opengl) as eye:
+        eye.place(qpos)
+        drawn = eye.take(pose)
+        straight = eye.take(pose, Pinhole(160, 120))
+    light, given = Light(sun=sun, film=FILM), [jnp.asarray(v, jnp.float32) for v in (pose.position, pose.rotation)]
+    shapes = placed(rover_shapes(rover), rover, jnp.asarray(qpos, jnp.float32))
+    seen = jax.tree.map(np.asarray, jax.jit(lambda p, t: picture(bumpy(), p, t, camera, light, shapes))(*given))
+    alike, unlike = ((seen.label == images.segmentation).mean() for images in (drawn, straight))
+    assert alike > 0.985 and 1.0 - unlike > 2.0 * (1.0 - alike)
+    both = (seen.label == drawn.segmentation) & np.isfinite(seen.depth) & np.isfinite(drawn.depth)
+    assert np.median(np.abs(drawn.depth[both] / seen.depth[both] - 1.0)) < 0.002
+    ground = both & (seen.label == 1)
+    colours = drawn.rgba[..., :3] / 255.0
+    assert np.median(colours[ground]) == pytest.approx(float(np.median(seen.rgb[ground])), rel=0.2)
+    # dust on the lens brightens the sky by the picture's own mean, and corners darken, in both
+    skies = [np.median(a[b == 0], axis=0) for a, b in ((colours, drawn.segmentation), (seen.rgb, seen.label))]
+    assert skies[0] == pytest.approx(skies[1], rel=0.1) and skies[1].min() > 0.05
+
+
+def test_opengls_noise_is_as_large_as_its_electrons_say(scene) -> None:
     camera, qpos = scene
-    with pytest.raises(UserError, match="is not drawn by OpenGL"):
-        camera.take(look_at((2.0, 2.0, 2.0), qpos[:3]), WIDE)
+    pose, optics = look_at((2.0, 2.0, 2.0), qpos[:3]), Pinhole(80, 60)
+    plain = camera.picture(pose, optics).astype(float) / 255.0
+    film = camera.film
+    try:
+        camera.film = Film(full_well=2000.0, read_noise=10.0)
+        noisy = [camera.picture(pose, optics, random=np.random.default_rng(k)).astype(float) / 255.0 for k in (0, 0, 1)]
+        assert (camera.picture(pose, optics) == np.rint(255.0 * plain)).all()  # no noise without its numbers
+    finally:
+        camera.film = film
+    assert (noisy[0] == noisy[1]).all() and (noisy[0] != noisy[2]).any()
+    light, found = plain**2.2, noisy[0] ** 2.2
+    middling = (plain > 0.3) & (plain < 0.9)
+    spread = np.sqrt(2000.0 * light + 100.0) / 2000.0
+    assert np.std(((found - light) / spread)[middling]) == pytest.approx(1.0, abs=0.1)
