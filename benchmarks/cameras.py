@@ -2,9 +2,11 @@
 
     python benchmarks/cameras.py --batches 4,16 --sizes 64x48,320x240 --repeats 2 --out benchmarks/cameras_2cores.json
     python benchmarks/cameras.py --only pictures --batches 8192 --sizes 64x48,320x240 --out benchmarks/cameras_h100.json
+    python benchmarks/cameras.py --only pictures --dust --batches 8192,24576 --sizes 64x48 --out dust.json
 
-Pictures are colour, depth and labels with shadows. A row of the JAX cameras counts only where `median_error` is there:
-the depth of one picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
+Pictures are colour, depth and labels with shadows. With `--dust` every wheel throws soil, which colour shows; `--lens`
+bends pictures, the renderer's too. A row of the JAX cameras counts only where `median_error` is there: the depth of one
+picture of the same size against MuJoCo's renderer; `labels` is the share of pixels whose label agrees.
 Where there is OpenGL, what the renderer drew is kept in `cameras_drawn.npz`; where there is none, as on most machines
 with a large GPU, pictures are held against that file, and there is no row of the renderer. `mebibytes` is what the
 compiled program needs beyond arguments and results. `ssim` is the structural similarity of a boulder's colour with the
@@ -35,6 +37,7 @@ from lunar_mjx.cameras import (
     depth_images,
     front_mount,
     height_scan,
+    lens_of,
     mounted,
     pictures,
 )
@@ -75,6 +78,16 @@ def spread(model: Model, count: int) -> jax.Array:
     return reset(reach * jnp.cos(turn), reach * jnp.sin(turn), turn)
 
 
+def spinning(model: Model, count: int) -> jax.Array:
+    """Velocities of rovers that drive at 0.2 m/s while the rims of their wheels turn at 0.5: all throw dust."""
+    mj = model.rover.compile()
+    qvel = np.zeros(mj.nv, np.float32)
+    qvel[0] = 0.2
+    for wheel in model.rover.wheels:
+        qvel[int(mj.joint(wheel.drive).dofadr[0])] = 0.5 / wheel.radius
+    return jnp.broadcast_to(qvel, (count, mj.nv))
+
+
 def renderer_rows(model: Model, sizes: list[Pinhole], qpos: np.ndarray, repeats: int) -> list[dict]:
     """MuJoCo's renderer, one rover at a time: pictures per second, and the depth images for comparison."""
     rows = []
@@ -112,7 +125,7 @@ def thinned(picture: np.ndarray) -> np.ndarray:
 def keep_or_recall(rows: list[dict], about: str, sizes: list[Pinhole]) -> list[dict]:
     """What the renderer drew, thinned: kept in `DRAWN` where it drew, read from there where it could not."""
     kept = dict(np.load(DRAWN)) if DRAWN.is_file() else {}
-    keys = [f"{about} {c.width}x{c.height}" for c in sizes]
+    keys = [f"{about} {c.width}x{c.height}" + (f" {c.lens}" if c.lens else "") for c in sizes]
     for row, key in zip(rows, keys, strict=False):
         kept |= {f"{key} depth": thinned(row["depth"]).astype(np.float32), f"{key} labels": thinned(row["labels"])}
     if rows:
@@ -132,7 +145,8 @@ def picture_rows(
     for batch in batches:
         at_once = max(1, min(batch, given.pixels // (camera.width * camera.height)))
         look = partial(pictures, rover=model.rover, camera=camera, at_once=at_once if at_once < batch else None)
-        program = jax.jit(lambda t, q, look=look: look(t, qpos=q))
+        qvel = spinning(model, batch) if given.dust else None
+        program = jax.jit(lambda t, q, look=look, qvel=qvel: look(t, qpos=q, qvel=qvel))
         started = time.perf_counter()
         compiled = program.lower(terrain, qpos[:batch]).compile()
         compiling = time.perf_counter() - started
@@ -148,7 +162,7 @@ def picture_rows(
         needed = compiled.memory_analysis()
         rows.append(
             {
-                "kind": "rgb, depth, labels, JAX",
+                "kind": "rgb, depth, labels, JAX" + ", lens" * bool(camera.lens) + ", dust" * given.dust,
                 "size": [camera.width, camera.height],
                 "batch": batch,
                 "images_per_s": batch / each,
@@ -173,12 +187,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pixels", type=int, default=80_000_000, help="largest number of pixels at once")
     parser.add_argument("--only", choices=("all", "pictures"), default="all", help="leave out depth and height images")
+    parser.add_argument("--dust", action="store_true", help="all wheels throw soil, which colour shows")
+    parser.add_argument("--lens", default="", help="k1,k2,p1,p2,k3 of the lens; a pinhole if left out")
     parser.add_argument("--lock", type=Path, help="file that is locked while a row is timed, for runs side by side")
     parser.add_argument("--out", type=Path, default=Path("cameras.json"))
     given = parser.parse_args()
     LOCK[:] = [given.lock] if given.lock else []
     model = make_model(given.rover, given.terrain)
-    sizes = [Pinhole(*map(int, s.split("x"))) for s in given.sizes.split(",")]
+    lens = lens_of([float(k) for k in given.lens.split(",") if k], "cameras.py", "--lens")
+    sizes = [Pinhole(*map(int, s.split("x")), lens=lens) for s in given.sizes.split(",")]
     batches = [int(b) for b in given.batches.split(",")]
     qpos = spread(model, max(batches))
     drawn = renderer_rows(model, sizes, np.asarray(qpos[0], float), given.repeats)

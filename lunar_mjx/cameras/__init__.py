@@ -13,6 +13,7 @@ from lunar_mjx.cameras.camera import RoverCamera as RoverCamera
 from lunar_mjx.cameras.chase import wheel_tracks as wheel_tracks
 from lunar_mjx.cameras.dust.recorded import Dust as Dust
 from lunar_mjx.cameras.dust.recorded import wheel_motion as wheel_motion
+from lunar_mjx.cameras.dust.steady import steady_dust as steady_dust
 from lunar_mjx.cameras.lens import Lens as Lens
 from lunar_mjx.cameras.lens import lens_of as lens_of
 from lunar_mjx.cameras.mount import facing as facing

@@ -2,7 +2,7 @@
 
 One ray a pixel finds what is seen, a second one whether the Sun reaches it: shadows are hard, from ground, rocks and
 rovers, at any height of the Sun. Light that sunlit ground throws onto what faces it stands in for what a path tracer
-would gather; Earth shines without shadows.
+would gather; Earth shines without shadows. Dust that wheels throw up veils what lies behind it.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from lunar_mjx.cameras.dust.grains import SPRAY, Grains
+from lunar_mjx.cameras.dust.steady import steady_dust
+from lunar_mjx.cameras.dust.veil import veil
 from lunar_mjx.cameras.mount import front_mount
 from lunar_mjx.cameras.photometry import ROCK_BRIGHTNESS, Film, Regolith
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
 from lunar_mjx.cameras.raymarch import in_parts, mounted
-from lunar_mjx.cameras.rays.trace import GROUND, ROCK, ROVER, SKY, trace
+from lunar_mjx.cameras.rays.trace import GROUND, ROCK, ROVER, SKY, sunlit, trace
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.shapes import Placed, bodies, placed, rover_shapes, together
 from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
@@ -88,6 +91,8 @@ def picture(
     key: Any = None,
     far: float = 60.0,
     lit: bool = True,
+    dust: Grains | None = None,
+    smear: int = SPRAY.smear,
 ) -> Pictures:
     """Colour, depth and labels of one camera.
 
@@ -101,11 +106,14 @@ def picture(
       key: random key of the noise; no noise if None.
       far: largest depth that is looked for, m.
       lit: whether colour is sought; without it no ray asks for shadows.
+      dust: grains in flight, which colour shows, and neither depth nor labels; see `steady_dust` and `Dust.at`.
+      smear: places along the streak that a grain draws while the picture is exposed.
     """
     light = light or Light()
     dtype = position.dtype
     to_sun = jnp.asarray(light.sun.direction if sun is None else sun, dtype) if lit else None
-    found = trace(terrain, position, turn, camera, far, to_sun, None if rovers is None else bodies(rovers))
+    solid = None if rovers is None else bodies(rovers)
+    found = trace(terrain, position, turn, camera, far, to_sun, solid)
     if to_sun is None:
         return Pictures(None, found.depth, found.label)
     depth, label, face = found.depth, found.label, found.face
@@ -119,6 +127,9 @@ def picture(
     else:
         bright = bright * jnp.asarray(TINT, dtype)
     bright = jnp.where((label == SKY)[..., None], 0.0, bright)
+    if dust is not None:
+        shone = sunlit(terrain, jnp.asarray(dust.position, dtype), to_sun, solid)
+        bright = veil(bright, depth, position, turn, camera, dust, shone, to_sun, light.soil, smear)
     return Pictures(_exposed(bright, light, camera, to_sun, key), depth, label)
 
 
@@ -132,6 +143,10 @@ def pictures(
     others: Float[Array, "rover other nq"] | None = None,
     at_once: int | None = None,
     detail: bool = False,
+    qvel: Float[Array, "rover nv"] | None = None,
+    others_qvel: Float[Array, "rover other nv"] | None = None,
+    gravity: Any = SPRAY.gravity,
+    grains: int = 24,
     **more: Any,
 ) -> Pictures:
     """What the front cameras of many rovers see of ground, rocks, themselves and each other.
@@ -143,6 +158,9 @@ def pictures(
       others: coordinates of other rovers of the kind that each camera may see.
       at_once: how many pictures are in memory at once; all if None, at most 65,535.
       detail: whether parts too small for small pictures are drawn, such as grousers.
+      qvel: velocities of the MJCF, if the soil that wheels throw up is to be seen; see `steady_dust`.
+      others_qvel: those of the others. gravity: under which it flies, m/s2.
+      grains: drawn of each wheel; more look finer in large pictures, and take time.
       more: `far`, `paint` and `lit` of `picture`.
     """
     # Small by default: pictures for learning, not for looking.
@@ -150,14 +168,21 @@ def pictures(
     camera_mount = mount or front_mount(rover)
 
     def one(given: tuple) -> Pictures:
-        position, turn = mounted(camera_mount, given[0])
-        seen = placed(shapes, rover, given[0])
-        if others is not None:
-            seen = together(seen, *(placed(shapes, rover, given[1][i]) for i in range(others.shape[1])))
-        return picture(terrain, position, turn, optics, light, seen, **more)
+        own, own_velocity, other, other_velocity = given
+        position, turn = mounted(camera_mount, own)
+        seen = [placed(shapes, rover, own)]
+        flying = [] if own_velocity is None else [steady_dust(terrain, rover, own, own_velocity, gravity, grains)]
+        if other is not None:
+            seen += [placed(shapes, rover, q) for q in other]
+        if other is not None and other_velocity is not None:
+            pairs = zip(other, other_velocity, strict=True)
+            flying += [steady_dust(terrain, rover, q, v, gravity, grains) for q, v in pairs]
+        scene = together(*seen) if len(seen) > 1 else seen[0]
+        dust = Grains(*(jnp.concatenate(part) for part in zip(*flying, strict=True))) if flying else None
+        # A grain stands for so much soil that it is wider than its streak is long.
+        return picture(terrain, position, turn, optics, light, scene, dust=dust, smear=1, **more)
 
-    given = (qpos,) if others is None else (qpos, others)
-    return in_parts(one, given, at_once)
+    return in_parts(one, (qpos, qvel, others, others_qvel), at_once)
 
 
 def stereo(mount: Pose, baseline: float) -> tuple[Pose, Pose]:

@@ -15,7 +15,7 @@ from lunar_mjx.cameras.gl import Offscreen, Post
 from lunar_mjx.cameras.mount import carried, front_mount
 from lunar_mjx.cameras.photometry import Film, Regolith
 from lunar_mjx.cameras.pinhole import Pinhole, Pose
-from lunar_mjx.cameras.resample import looked_up, source
+from lunar_mjx.cameras.resample import depth_and_labels, looked_up, source
 from lunar_mjx.cameras.scene import FAR_GROUND, GROUND, ROCK, Sun, build_scene, shadow_light
 from lunar_mjx.cameras.texture import Track
 from lunar_mjx.errors import bad_input
@@ -157,8 +157,7 @@ class RoverCamera:
         rgba = np.concatenate([colours, np.full((*colours.shape[:2], 1), 255, np.uint8)], axis=-1)
         labels = self._labels[geoms]
         if optics.lens is not None:
-            drawn = _drawn(optics, self._size)
-            depth, labels = (looked_up(optics, drawn, seen, between=False) for seen in (depth, labels))
+            depth, labels = depth_and_labels(optics, _drawn(optics, self._size), depth, labels)
         return Images(rgba, depth, labels, pose.view_matrix(), optics.projection_matrix())
 
     def picture(
@@ -186,8 +185,8 @@ class RoverCamera:
         colours, depth = self._offscreen.colours_and_depth()
         light = _LIGHT[colours]
         if drawn is not optics:
-            light = looked_up(optics, drawn, light, between=True)
-            depth = looked_up(optics, drawn, depth, between=False)
+            light = looked_up(optics, drawn, light)
+            depth, _ = depth_and_labels(optics, drawn, depth, np.isfinite(depth))
         towards = self.sun.direction
         gain = float(Film().gain(Regolith(), towards[2]))
         if dust is not None and flies:

@@ -42,17 +42,37 @@ def source(camera: Pinhole, most: tuple[int, int]) -> Pinhole:
     return dataclasses.replace(camera, width=width, height=height, fovy_deg=fovy, lens=None)
 
 
-def looked_up(camera: Pinhole, drawn: Pinhole, picture: np.ndarray, between: bool) -> np.ndarray:
-    """A picture as `camera` sees it, (height, width, ...) float64 or the picture's own type.
+def looked_up(camera: Pinhole, drawn: Pinhole, light: np.ndarray) -> np.ndarray:
+    """Light as `camera` sees it, (height, width, 3), by the means between neighbours.
 
     Args:
-      camera: with a lens. drawn: that took the picture, see `source`. picture: (rows, columns) or with colours.
-      between: whether neighbours are averaged, as for light; else the nearest pixel is taken, as for labels.
+      camera: with a lens. drawn: that took the picture, see `source`. light: (rows, columns, 3) of it.
     """
+    places = _places(camera, drawn)
+    return np.stack([map_coordinates(light[..., k], places, float, order=1) for k in range(3)], axis=-1)
+
+
+def depth_and_labels(
+    camera: Pinhole, drawn: Pinhole, depth: np.ndarray, labels: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth, m, and labels as `camera` sees them, (height, width): labels of the nearest pixel.
+
+    Args:
+      camera, drawn: as in `looked_up`. depth: (rows, columns) m, infinite in the sky. labels: of the same pixels.
+    """
+    row, column = _places(camera, drawn)
+    near = np.rint(row).astype(int), np.rint(column).astype(int)
+    i, j = np.floor(row).astype(int), np.floor(column).astype(int)
+    # Where all neighbours show one thing, between them: over the picture, one over depth is linear on a plane.
+    alike = np.ones(row.shape, bool)
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        alike &= labels[i + down, j + right] == labels[near]
+    with np.errstate(divide="ignore"):
+        between = 1.0 / map_coordinates(1.0 / depth, (row, column), float, order=1)
+    return np.where(alike, between, depth[near]), labels[near]
+
+
+def _places(camera: Pinhole, drawn: Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the drawn picture, 0 the middle of the first pixel, that each pixel's ray meets."""
     rays = camera.rays()
-    row = 0.5 * drawn.height - drawn.focal * rays[..., 1] - 0.5
-    column = 0.5 * drawn.width + drawn.focal * rays[..., 0] - 0.5
-    if not between:
-        return picture[np.rint(row).astype(int), np.rint(column).astype(int)]
-    colours = [map_coordinates(picture[..., k], [row, column], float, order=1) for k in range(picture.shape[-1])]
-    return np.stack(colours, axis=-1)
+    return (0.5 * drawn.height - drawn.focal * rays[..., 1] - 0.5, 0.5 * drawn.width + drawn.focal * rays[..., 0] - 0.5)

@@ -44,6 +44,8 @@ class Spray:
     """Least height of the unit vector across the axle and upwards of a wheel that throws."""
     touch: float = 0.01
     """Distance from the ground within which a wheel touches it, m: grids of pictures and of physics differ by less."""
+    gravity: float = 1.625
+    """Of the Moon, under which grains fly unless told otherwise, m/s2."""
     heaviest: float = 2.0
     """Gravity from which on there is taken to be air, and no dust is drawn, m/s2."""
 
@@ -136,7 +138,7 @@ def judged(
 
 
 def released(
-    xp: Any, throw: Throw, radius: Any, width: Any, chances: tuple[Any, Any, Any, Any]
+    xp: Any, throw: Throw, radius: Any, width: Any, chances: tuple[Any, ...]
 ) -> tuple[Float[Any, "grain 3"], Float[Any, "grain 3"]]:
     """Place, m, and velocity, m/s, of grains as they leave the rim.
 

@@ -73,7 +73,7 @@ def veiled(
       gain: light on the sensor of I/F = 1. soil: what the grains are of.
     """
     height, width = depth.shape
-    places, spread, area, who = _streaks(np, grains)
+    places, spread, area, who = _streaks(np, grains, SPRAY.smear)
     column, row, away = project(pose, camera, places).T
     near = (away > camera.near) & (abs(column - 0.5 * width) < width) & (abs(row - 0.5 * height) < height)
     x, y, z = ((places - pose.position) @ pose.rotation).T
@@ -107,18 +107,19 @@ def veil(
     lit: Float[Array, "grain"],
     to_sun: Float[Array, "3"],
     soil: Regolith,
+    smear: int = SPRAY.smear,
 ) -> Float[Array, "height width 3"]:
     """I/F with grains before what it shows, of one camera: what `veiled` does, in JAX.
 
-    Time goes with pixels times grains.
+    Time goes with pixels times grains times places along their streaks.
 
     Args:
       bright: I/F without grains. depth: m along the axis. position, turn: of the camera, as in `Pose`.
       camera: optics. grains: in flight; those without area are none. lit: 1 where the Sun reaches a grain.
-      to_sun: unit vector towards the Sun. soil: what the grains are of.
+      to_sun: unit vector towards the Sun. soil: what the grains are of. smear: places along a grain's streak.
     """
     dtype = bright.dtype
-    places, spread, area, who = _streaks(jnp, Grains(*(jnp.asarray(g) for g in grains)))
+    places, spread, area, who = _streaks(jnp, Grains(*(jnp.asarray(g) for g in grains)), smear)
     x, y, z = (jnp.sum((places - position) * turn[:, i], axis=-1) for i in range(3))
     away = jnp.where(-z > camera.near, -z, 1.0)
     right, down = x / away, -y / away
@@ -148,12 +149,13 @@ def veil(
     return _through(jnp, bright, total, shine, soil.cloud(cos_phase))
 
 
-def _streaks(xp: Any, grains: Grains) -> tuple[Any, Any, Any, Any]:
+def _streaks(xp: Any, grains: Grains, smear: int) -> tuple[Any, Any, Any, Any]:
     """Places along the way of each grain while a picture is exposed: where, how wide, cross-section, which grain."""
-    late = SPRAY.shutter * np.linspace(-0.5, 0.5, SPRAY.smear)[:, None, None]
+    shares = np.linspace(-0.5, 0.5, smear) if smear > 1 else np.zeros(1)
+    late = SPRAY.shutter * shares[:, None, None]
     places = (grains.position + late * grains.velocity).reshape(-1, 3)
-    who = np.tile(np.arange(len(grains.area)), SPRAY.smear)
-    return places, xp.tile(grains.spread, SPRAY.smear), xp.tile(grains.area / SPRAY.smear, SPRAY.smear), who
+    who = np.tile(np.arange(len(grains.area)), smear)
+    return places, xp.tile(grains.spread, smear), xp.tile(grains.area / smear, smear), who
 
 
 def _widest(camera: Pinhole) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -120,17 +120,43 @@ def trace(
     if bent:
         # Right and up over the depth, pixel after pixel: what a lens bends is no formula of column and row.
         given.append(jnp.asarray(np.moveaxis(camera.rays()[..., :2], -1, 0).reshape(-1), dtype))
-    if kernel == "arrays" or (kernel == "auto" and jax.default_backend() != "gpu"):
-        found = _by_arrays(plan, *given)
-    elif kernel == "interpreted":
-        found = _by_kernel(plan, *given, interpret=True)
-    else:
-        # Chosen when the program is lowered: the same traced function may run on a CPU later.
-        found = jax.lax.platform_dependent(
-            *given, cuda=functools.partial(_by_kernel, plan), default=functools.partial(_by_arrays, plan)
-        )
+    found = _dispatched(kernel, functools.partial(_by_arrays, plan), functools.partial(_by_kernel, plan), given)
     depth, label, which, *face, lit = (f.reshape(camera.height, camera.width) for f in found)
     return Traced(depth, label, which, jnp.stack(face, axis=-1), lit)
+
+
+def sunlit(
+    terrain: Terrain,
+    places: Float[Array, "n 3"],
+    to_sun: Float[Array, "3"],
+    bodies: Bodies | None = None,
+    kernel: str = "auto",
+) -> Float[Array, "n"]:
+    """1 for places that the Sun reaches, 0 for those in the shadow of ground, rocks or rovers.
+
+    Args:
+      terrain: ground and rocks. places: m, above the ground. to_sun: unit vector. bodies: of rovers.
+      kernel: as in `trace`.
+    """
+    grid, table = ground.tables(terrain)
+    dtype = places.dtype
+    plan = _Plan(grid, (0,) * 4 if bodies is None else bodies.counts, len(places), 1, 1.0, 0.0, True, False)
+    shapes = jnp.zeros(solids.WIDTH, dtype) if bodies is None else bodies.table
+    given = [table, jnp.asarray(to_sun, dtype), shapes, places.T.reshape(-1)]
+    (lit,) = _dispatched(
+        kernel, functools.partial(_places_by_arrays, plan), functools.partial(_places_by_kernel, plan), given
+    )
+    return lit
+
+
+def _dispatched(kernel: str, arrays: Callable, one_kernel: Callable, given: list) -> tuple:
+    """What one of two programs gives, by the name of the kernel that `trace` takes."""
+    if kernel == "arrays" or (kernel == "auto" and jax.default_backend() != "gpu"):
+        return arrays(*given)
+    if kernel == "interpreted":
+        return one_kernel(*given, interpret=True)
+    # Chosen when the program is lowered: the same traced function may run on a CPU later.
+    return jax.lax.platform_dependent(*given, cuda=one_kernel, default=arrays)
 
 
 def _pixels(
@@ -182,15 +208,21 @@ def _pixels(
     # no ray for what is turned away from the Sun, nor below the horizon
     sought = (label != SKY) & (face.dot(sun) > 0.0) & (sun.z > 0.0)
     # Off the surface along its normal, or rounding would let the surface shade itself.
-    start, way = point + face * TRACE.skin, Vec3(*(s + zero for s in sun))
+    lit = _reached(plan, table, shapes, load, point + face * TRACE.skin, sun, sought)
+    return depth, label, which, *face, lit
+
+
+def _reached(plan: _Plan, table: Tables, shapes: Any, load: Load, start: Vec3, sun: Vec3, sought: Any) -> Any:
+    """1 where the Sun reaches places and that is `sought`, else 0."""
+    zero = jnp.zeros_like(start.x)
+    way = Vec3(*(s + zero for s in sun))
     end = jnp.where(sought, FAR, -FAR)
     if sum(plan.counts):
         _, shape = solids.meet(plan.counts, shapes, load, start, way, end)
         sought = sought & (shape < 0)
         end = jnp.where(sought, FAR, -FAR)
     shadow = ground.meet(plan.grid, table, load, start, way, zero + TRACE.shadow_start, end, TRACE.upon)
-    lit = jnp.where(sought & (shadow.rock < -1), 1.0, zero)
-    return depth, label, which, *face, lit
+    return jnp.where(sought & (shadow.rock < -1), 1.0, zero)
 
 
 def _by_arrays(plan: _Plan, table: Tables, view: Any, shapes: Any, optics: Any = None) -> tuple:
@@ -211,36 +243,76 @@ def _by_kernel(
     plan: _Plan, table: Tables, view: Any, shapes: Any, optics: Any = None, interpret: bool = False
 ) -> tuple:
     """`_pixels` as one kernel, each program with one tile."""
-    from jax.experimental import pallas
-    from jax.experimental.pallas import triton
-
     wide, high = TRACE.tile
     across, down = math.ceil(plan.width / wide), math.ceil(plan.height / high)
+
+    def some(load: Load, number: Any, lane: Any, *given: Any) -> tuple:
+        table, (view_, shapes_, *optics_) = Tables(*given[:5]), given[5:]
+        # Tiles and not rows: neighbouring rays ask the same squares, which then are in the cache.
+        column = (number % across) * wide + lane % wide
+        row = (number // across) * high + lane // wide
+        found = _pixels(plan, table, view_, shapes_, optics_[0] if plan.bent else None, load, column, row)
+        return found, row * plan.width + column, (column < plan.width) & (row < plan.height)
+
+    given = (*table, view, shapes, *(() if optics is None else (optics,)))
+    kinds = (view.dtype, jnp.int32, jnp.int32, *(view.dtype,) * 4)
+    return _launched(some, across * down, plan.width * plan.height, kinds, given, interpret, "trace")
+
+
+def _places_by_arrays(plan: _Plan, table: Tables, sun: Any, shapes: Any, places: Any) -> tuple:
+    """`_reached` of places, all x and then all y and z, on arrays."""
+    start = Vec3(*places.reshape(3, -1))
+    sought = jnp.broadcast_to(sun[2] > 0.0, start.x.shape)
+    return (_reached(plan, table, shapes, ground.take, start, Vec3(*sun), sought),)
+
+
+def _places_by_kernel(plan: _Plan, table: Tables, sun: Any, shapes: Any, places: Any, interpret: bool = False) -> tuple:
+    """`_reached` of places as one kernel, each program with as many as a tile has pixels."""
+    lanes = TRACE.tile[0] * TRACE.tile[1]
+
+    def some(load: Load, number: Any, lane: Any, *given: Any) -> tuple:
+        table, (sun_, shapes_, places_) = Tables(*given[:5]), given[5:]
+        place = number * lanes + lane
+        kept = place < plan.width
+        at = jnp.where(kept, place, 0)
+        start = Vec3(*(load(places_, at + k * plan.width) for k in range(3)))
+        to_sun = Vec3(*(sun_[k] for k in range(3)))
+        return (_reached(plan, table, shapes_, load, start, to_sun, kept & (to_sun.z > 0.0)),), place, kept
+
+    given = (*table, sun, shapes, places)
+    programs = math.ceil(plan.width / lanes)
+    return _launched(some, programs, plan.width, (places.dtype,), given, interpret, "sunlit")
+
+
+def _launched(
+    some: Callable, programs: int, count: int, kinds: Sequence[Any], given: Sequence[Any], interpret: bool, name: str
+) -> tuple:
+    """Arrays (count,) of `kinds` that a kernel fills, each program a few places.
+
+    Args:
+      some: of `load`, the program's number, its lanes and references to `given`: values of its lanes, where they
+        belong, and which are kept. programs, count, kinds, given, name: of the kernel. interpret: on any device.
+    """
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
 
     def load(ref: Any, index: Any) -> Any:
         return triton.load(ref.at[index]) if np.ndim(index) else ref[index]
 
     def program(*refs: Any) -> None:
-        given, view_ref, shapes_ref, out = Tables(*refs[:5]), refs[5], refs[6], refs[7 + plan.bent :]
-        number, lane = pallas.program_id(0), jnp.arange(wide * high, dtype=jnp.int32)
-        # Tiles and not rows: neighbouring rays ask the same squares, which then are in the cache.
-        column = (number % across) * wide + lane % wide
-        row = (number // across) * high + lane // wide
-        found = _pixels(plan, given, view_ref, shapes_ref, refs[7] if plan.bent else None, load, column, row)
-        kept = (column < plan.width) & (row < plan.height)
-        # Pixels beyond the edge aim at the first one, and the mask keeps them from writing.
-        place = jnp.where(kept, row * plan.width + column, 0)
-        for ref, value in zip(out, found, strict=True):
+        lane = jnp.arange(TRACE.tile[0] * TRACE.tile[1], dtype=jnp.int32)
+        found, place, kept = some(load, pallas.program_id(0), lane, *refs[: len(given)])
+        # Lanes beyond the edge aim at the first place, and the mask keeps them from writing.
+        place = jnp.where(kept, place, 0)
+        for ref, value in zip(refs[len(given) :], found, strict=True):
             triton.store(ref.at[place], value, mask=kept)
 
-    count, dtype = plan.width * plan.height, view.dtype
-    kinds = (dtype, jnp.int32, jnp.int32, *(dtype,) * 4)
     call: Callable = pallas.pallas_call(
         program,
         out_shape=[jax.ShapeDtypeStruct((count,), k) for k in kinds],
-        grid=(across * down,),
+        grid=(programs,),
         compiler_params=None if interpret else triton.CompilerParams(num_warps=TRACE.warps, num_stages=1),
         interpret=interpret,
-        name="trace",
+        name=name,
     )
-    return tuple(call(*table, view, shapes, *(() if optics is None else (optics,))))
+    return tuple(call(*given))

@@ -57,6 +57,7 @@ class NavigationConfig:
       camera_width, camera_height: pixels of the blocks camera/rgb, camera/depth and camera/labels.
       camera_fovy_deg: vertical angle of view. camera_pitch_deg: how far the camera looks down. camera_far: how far it
         looks, m. camera_lens: its distortion, `D` of a ROS CameraInfo: k1, k2, p1, p2, k3; none if empty.
+      camera_dust: whether camera/rgb shows the soil that wheels throw up; there is none on hard ground or in air.
       sun_azimuth_deg, sun_elevation_deg: where the Sun stands, clockwise from north (y).
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
         dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`, and so a rover that is
@@ -107,6 +108,7 @@ class NavigationConfig:
     camera_pitch_deg: float = FRONT_MOUNT.pitch_deg
     camera_far: float = 60.0
     camera_lens: tuple[float, ...] = ()
+    camera_dust: bool = True
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
     delay: float = 0.0

@@ -851,6 +851,8 @@ class NavigationEnv:
         seen = None
         if any(name.startswith(CAMERA) for name in names):
             # Pictures only where a block or a critic asks for them, and their light only where it shows.
+            colour = CAMERA + "rgb" in names
+            dusty = colour and c.camera_dust and "hard_surface" not in self.model.effect_names
             seen = pictures(
                 terrain,
                 self.model.rover,
@@ -859,7 +861,9 @@ class NavigationEnv:
                 front_mount(self.model.rover, c.camera_pitch_deg),
                 Light(sun=c.sun),
                 far=c.camera_far,
-                lit=CAMERA + "rgb" in names,
+                lit=colour,
+                qvel=inner.physics.qvel if dusty else None,
+                gravity=self.model.gravity,
             )
         return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far, c.mast)
 
