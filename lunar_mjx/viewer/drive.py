@@ -16,11 +16,13 @@ import numpy as np
 
 from lunar_mjx.backends import Backend
 from lunar_mjx.backends.base import observation
+from lunar_mjx.cameras.dust.grains import Grains
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.model import ZERO_CELSIUS, Model
 from lunar_mjx.simulate import Commands, check_start
 from lunar_mjx.viewer.pilot import Pilot, drivable
+from lunar_mjx.viewer.thrown import LiveDust
 
 ENGINES = ("auto", "native", "structured", "mjx")
 
@@ -103,6 +105,10 @@ class Drive(Protocol):
         """Goes on by about a duration, s; returns by how much it did."""
         ...
 
+    def dust(self) -> Grains:
+        """What the wheels throw up now."""
+        ...
+
     def bodies(self) -> np.ndarray:
         """Position, m, and quaternion of every body, (body, 7), in the world."""
         ...
@@ -154,6 +160,7 @@ class LiveDrive:
         self._drives = [self.model.rover.joints.index(w.drive) for w in self.model.rover.wheels]
         self._joints = joint_channels(self.model.rover)
         self._behind, self.rate = 0.0, 1.0
+        self._thrown = LiveDust(self.model)
         self.reset()
 
     def reset(self) -> None:
@@ -162,6 +169,7 @@ class LiveDrive:
         self.pilot.halt()
         self.path, self._behind, self.note = 0.0, 0.0, ""
         self.time, self._place = 0.0, np.zeros(2)
+        self._thrown.begin()
         self._go()
 
     def advance(self, duration: float) -> float:
@@ -197,6 +205,11 @@ class LiveDrive:
         self.path += float(np.hypot(*(place - self._place))) if self.time else 0.0
         self.time += interval
         self._place = place
+        self._thrown.add(self.time, self.qpos)
+
+    def dust(self) -> Grains:
+        """What the wheels throw up now."""
+        return self._thrown.at(self.time)
 
     def bodies(self) -> np.ndarray:
         """Place and quaternion (w, x, y, z) of every body of the rover's MJCF, (body, 7), the world's first."""

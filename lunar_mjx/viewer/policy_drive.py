@@ -10,6 +10,7 @@ import jax
 import mujoco
 import numpy as np
 
+from lunar_mjx.cameras.dust.grains import Grains
 from lunar_mjx.dynamics.signals import joint_channels
 from lunar_mjx.envs import NavigationEnv, split_keys
 from lunar_mjx.envs.navigation.view import Reader
@@ -17,6 +18,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.model import ZERO_CELSIUS
 from lunar_mjx.terrain import height
 from lunar_mjx.viewer.pilot import Onlooker
+from lunar_mjx.viewer.thrown import LiveDust
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +85,7 @@ class PolicyDrive:
         self._reset = jax.jit(lambda params, key: env.reset(params, split_keys(key, 1)))
         self._pose = jax.jit(self._reader.pose)
         self._told, self._ground = 0.0, 0.0
+        self._thrown = LiveDust(self.model)
         self._goal: np.ndarray | None = None
         self.reset()
         self._go()  # compiles before anybody waits for a picture
@@ -100,6 +103,8 @@ class PolicyDrive:
         self.time, self.path, self._behind = 0.0, 0.0, 0.0
         self._take()
         self._from = self._to
+        self._thrown.begin()
+        self._thrown.add(self.time, self._to)
 
     def _take(self) -> None:
         """Reads what a picture shows from the state."""
@@ -141,6 +146,7 @@ class PolicyDrive:
         self._take()
         self.time += self._env.control_interval
         self.path += float(np.hypot(*(self._to[:2] - self._from[:2])))
+        self._thrown.add(self.time, self._to)
 
     @property
     def qpos(self) -> np.ndarray:
@@ -150,6 +156,10 @@ class PolicyDrive:
         if float(far[3:7] @ self._from[3:7]) < 0.0:
             far[3:7] *= -1.0  # the same attitude, and the shorter way to it
         return (1.0 - share) * self._from + share * far
+
+    def dust(self) -> Grains:
+        """What the wheels throw up in the moment that is shown, which lies before the last state."""
+        return self._thrown.at(self.time - max(self._env.control_interval - self._behind, 0.0))
 
     def bodies(self) -> np.ndarray:
         """Place and quaternion (w, x, y, z) of every body of the rover's MJCF, (body, 7), the world's first."""

@@ -10,6 +10,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lunar_mjx.cameras.dust.grains import Grains
+from lunar_mjx.cameras.dust.recorded import none
 from lunar_mjx.model import Model
 from lunar_mjx.terrain import surface
 from lunar_mjx.viewer.pilot import Onlooker
@@ -107,6 +109,10 @@ class Replay:
     def advance(self, duration: float) -> float:
         """Simulated time that passes in a tick, s: 0, since a recorded drive is complete."""
         return 0.0
+
+    def dust(self) -> Grains:
+        """Grains to send: none, since the wheels of a replay are drawn to roll, and how they slipped is not known."""
+        return none()
 
     def bodies(self) -> np.ndarray:
         """Poses of bodies to send: none, since the page holds the whole drive."""

@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lunar_mjx.cameras.dust.grains import Grains
+from lunar_mjx.cameras.photometry import Film, Regolith
 from lunar_mjx.cameras.scene import SCENE_DETAIL, Patch, Sun, cut
 from lunar_mjx.model import Model
 from lunar_mjx.rover.look import LOOK, seen_spec
@@ -41,7 +43,7 @@ _SHAPES = {
 
 def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
     """The rover's shapes, wheels, and the light, as plain data for JSON."""
-    rover = model.rover
+    rover, soil = model.rover, Regolith()
     mj = seen_spec(rover).compile()
     shapes = [
         _shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < LOOK.hidden and int(mj.geom_type[i]) in _SHAPES
@@ -58,7 +60,15 @@ def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
         "size": float(2.0 * np.abs(rover.chassis_points).max()),
         "sun": sun.direction.tolist(),
         "exposure": sun.exposure,
+        # How bright flying grains are beside level ground, by the formulas of the other cameras.
+        "cloud": [float(Film().gain(soil, float(sun.direction[2]))) / Film().mid, soil.albedo, soil.lobe, soil.back],
     }
+
+
+def dust_scene(grains: Grains) -> list[float]:
+    """Grains in flight, five numbers each: place x, y, z and spread, m, and cross-section, cm2."""
+    rows = np.column_stack([grains.position, grains.spread, 1e4 * grains.area])
+    return np.round(rows, 4).ravel().tolist()
 
 
 def _shape(mj: mujoco.MjModel, i: int) -> dict[str, Any]:

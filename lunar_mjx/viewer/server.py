@@ -27,7 +27,7 @@ from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.errors import bad_input
 from lunar_mjx.viewer.drive import Drive, Pace
 from lunar_mjx.viewer.pilot import KEYS
-from lunar_mjx.viewer.scene import ground_scene, rover_scene
+from lunar_mjx.viewer.scene import dust_scene, ground_scene, rover_scene
 
 LOOPBACK = "127.0.0.1"
 
@@ -175,10 +175,11 @@ class Viewer(ThreadingHTTPServer):
                 self.drive.pilot.hold([])
             readings = self.drive.readings()
             bodies = self.drive.bodies()
+            dust = self.drive.dust()
         if self.pace.failure is not None:
             readings["note"] = f"The simulation stopped: {self.pace.failure}"
         # Hundredths of a millimetre: text, sent 25 times a second.
-        text = json.dumps({"bodies": np.round(bodies, 5).tolist(), **_rounded(readings)})
+        text = json.dumps({"bodies": np.round(bodies, 5).tolist(), "dust": dust_scene(dust), **_rounded(readings)})
         with self._fresh:
             self._picture, self._count = text, self._count + 1
             self._fresh.notify_all()

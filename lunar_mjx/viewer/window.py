@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import sys
 import threading
@@ -13,7 +14,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lunar_mjx.cameras.dust.grains import Grains
+from lunar_mjx.cameras.dust.veil import sunlit
 from lunar_mjx.cameras.scene import Sun, build_scene, shadow_light
+from lunar_mjx.cameras.texture import ALBEDO
 from lunar_mjx.errors import UserError
 from lunar_mjx.viewer.drive import PACE, LiveDrive, Pace
 
@@ -29,6 +33,10 @@ class ViewSettings:
     """Backspace, with which MuJoCo's viewer resets too."""
     margin: float = 25.0
     """How far the ground is drawn finely around the start, m."""
+    ball: float = 1.5
+    """Radius of the ball that stands for a grain, over the spread of what it stands for."""
+    shade: float = 0.1
+    """Brightness of grains in shadow, over that of those in the Sun."""
 
 
 WINDOW = ViewSettings()
@@ -121,15 +129,31 @@ def _show(window: Any, model: mujoco.MjModel, data: mujoco.MjData, drive: LiveDr
     while window.is_running() and pace.failure is None:
         begin = time.monotonic()
         with pace.lock:
-            qpos, (names, values) = drive.qpos, captions(drive)
+            qpos, (names, values), dust = drive.qpos, captions(drive), drive.dust()
         with window.lock():
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
             mujoco.mj_camlight(model, data)
             data.light_xpos[0] = shadow_light(qpos[:3], sun)  # shadows are drawn around the light
+            _add_dust(window.user_scn, dust, sunlit(model, data, dust.position, sun.direction))
         window.set_texts((font, corner, names, values))
         window.sync()
         time.sleep(max(0.0, PACE.tick - (time.monotonic() - begin)))
+
+
+def _add_dust(scene: Any, grains: Grains, lit: np.ndarray) -> None:
+    """Fills the window's own scene with grains in flight, as balls that let light through; `lit` is (grain,)."""
+    count = min(len(grains.position), scene.maxgeom)
+    ball, turn = mujoco.mjtGeom.mjGEOM_SPHERE.value, np.eye(3).ravel()
+    for geom, place, spread, area, shines in zip(
+        scene.geoms[:count], grains.position, grains.spread, grains.area, lit, strict=False
+    ):
+        # As much light is taken as by the grain's cross-section, spread over the ball's.
+        radius = WINDOW.ball * spread
+        opaque = 1.0 - math.exp(-area / (math.pi * radius**2))
+        colour = np.array([*(ALBEDO * (1.0 if shines else WINDOW.shade)), opaque], np.float32)
+        mujoco.mjv_initGeom(geom, ball, np.full(3, radius), place, turn, colour)
+    scene.ngeom = count
 
 
 def captions(drive: LiveDrive) -> tuple[str, str]:

@@ -14,9 +14,12 @@ from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import Terrain
 
 
-def wheel_motion(rover: Rover, qpos: np.ndarray) -> WheelMotion:
-    """Where a rover's wheels are, and how far they have turned, for coordinates (time, nq) of its MJCF."""
-    model = rover.compile()
+def wheel_motion(rover: Rover, qpos: np.ndarray, compiled: mujoco.MjModel | None = None) -> WheelMotion:
+    """Where a rover's wheels are, and how far they have turned, for coordinates (time, nq) of its MJCF.
+
+    `compiled` is that MJCF, if it is at hand: to compile it takes longer than a row of coordinates.
+    """
+    model = rover.compile() if compiled is None else compiled
     data = mujoco.MjData(model)
     bodies = [model.body(w.body).id for w in rover.wheels]
     joints = [model.joint(w.drive).id for w in rover.wheels]

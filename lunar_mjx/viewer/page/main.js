@@ -7,7 +7,7 @@ import { cylinder, ground, pebbles, shapeOf, sphere } from "./shapes.js";
 
 const GROUND = [0.60, 0.585, 0.565], ROCK = GROUND.map((soil) => 1.5 * soil), STILL = pose([0, 0, 0], [1, 0, 0, 0]);
 const GHOST = [0.34, 0.71, 0.91], GHOSTLY = 0.55, POST = [0.03, 0.7], FLAG = [0.9, 0.62, 0.0];
-const FETCH_AGAIN = 7, BAR = 0.022, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
+const ANGLE = 0.75, FETCH_AGAIN = 7, BAR = 0.022, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
 
 async function json(path) {
   const answer = await fetch(path);
@@ -18,7 +18,7 @@ async function json(path) {
 class View {
   constructor(scene, canvas) {
     this.scene = scene;
-    this.renderer = new Renderer(canvas, scene.sun, scene.exposure);
+    this.renderer = new Renderer(canvas, scene.sun, scene.exposure, scene.cloud);
     this.rover = scene.shapes.filter((s) => s.colour[3] > 0).map((shape) => ({ mesh: this.renderer.upload(shapeOf(shape)),
       body: shape.body, local: pose(shape.place, shape.turn), colour: shape.colour.slice(0, 3),
       kind: shape.kind === "cylinder" && scene.wheels.some((w) => w.body === shape.body) ? 4 : 0 }));
@@ -89,8 +89,8 @@ class View {
     this.last = bodies;
   }
 
-  show(bodies, { ghost = null, goal = null } = {}) {
-    Object.assign(this, { ghost, goal });
+  show(bodies, { ghost = null, goal = null, dust = [] } = {}) {
+    Object.assign(this, { ghost, goal, dust });
     const chassis = bodies[this.scene.chassis], jumped = this.last &&
       Math.hypot(chassis[0] - this.last[this.scene.chassis][0], chassis[1] - this.last[this.scene.chassis][1]) > 0.5;
     if (jumped) {
@@ -120,13 +120,14 @@ class View {
     const eye = add(camera.target, scale(from, camera.away));
     eye[2] = Math.max(eye[2], (this.height?.(eye[0], eye[1]) ?? -Infinity) + 0.25);
     const { clientWidth: width, clientHeight: height } = this.renderer.canvas;
-    const clip = multiply(perspective(0.75, width / Math.max(height, 1), 0.05, 600), lookAt(eye, camera.target, [0, 0, 1]));
+    const clip = multiply(perspective(ANGLE, width / Math.max(height, 1), 0.05, 600), lookAt(eye, camera.target, [0, 0, 1]));
     const standing = (bodies, more) => this.rover.map((part) => {
       const body = bodies[part.body];
       return { ...part, ...more, model: multiply(pose(body.slice(0, 3), body.slice(3)), part.local) };
     });
     const ghost = this.ghost ? standing(this.ghost, { colour: GHOST, kind: 0, alpha: GHOSTLY }) : [];
-    this.renderer.draw([...standing(this.bodies), ...this.marks(), ...this.soil], ghost, at.slice(0, 3), eye, clip);
+    this.renderer.draw([...standing(this.bodies), ...this.marks(), ...this.soil], ghost, at.slice(0, 3), eye, clip,
+      { grains: this.dust, colour: GROUND, angle: ANGLE });
   }
 
   // Where the rover wants to go: a post with a ball on it.
@@ -191,6 +192,7 @@ async function start() {
     now.note ||= trouble;
     panel.show(now);
     view?.show(now.bodies, now);
+    document.body.dataset.grains = now.dust.length / 5;
     document.body.dataset.pictures = 1 + Number(document.body.dataset.pictures ?? 0);
   };
   pictures.onerror = () => panel.note("The drive has ended, or its connection is lost.");

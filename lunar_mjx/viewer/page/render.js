@@ -13,6 +13,13 @@ const DEPTH_FRAGMENT = `#version 300 es
 precision highp float;
 void main() {}`;
 
+// A filmic shoulder: the brightest parts of the rover keep their shading.
+const SHOWN = `
+vec3 shown(vec3 sum) {
+  vec3 film = sum * (2.51 * 0.62 * sum + 0.03 * 2.0) / (0.62 * sum * (2.43 * 0.62 * sum + 0.59) + 0.14) * 0.62;
+  return pow(clamp(film, 0.0, 1.0), vec3(1.0 / 2.0));
+}`;
+
 const VERTEX = `#version 300 es
 layout(location = 0) in vec3 place;
 layout(location = 1) in vec3 normal;
@@ -46,7 +53,7 @@ uniform int kind;            // 0 rover, 1 near ground, 2 far ground, 3 rock, 4 
 uniform sampler2DShadow shadows;
 uniform sampler2D tracks;
 out vec4 pixel;
-
+${SHOWN}
 float random(ivec2 p) {
   uint n = uint(p.x) * 1664525u + uint(p.y) * 22695477u + 1013904223u;
   n ^= n >> 15; n *= 2246822519u; n ^= n >> 13; n *= 3266489917u; n ^= n >> 16;
@@ -117,9 +124,7 @@ void main() {
   // fill: light thrown back by the ground, so that shadows are dark but not holes
   float fill = 0.06 + 0.05 * (1.0 - n.z);
   vec3 sum = base * (exposure * 1.35 * facingSun * light + fill) + vec3(shine * light * exposure);
-  // a filmic shoulder: the brightest parts of the rover keep their shading
-  vec3 film = sum * (2.51 * 0.62 * sum + 0.03 * 2.0) / (0.62 * sum * (2.43 * 0.62 * sum + 0.59) + 0.14) * 0.62;
-  pixel = vec4(pow(clamp(film, 0.0, 1.0), vec3(1.0 / 2.0)), alpha);
+  pixel = vec4(shown(sum), alpha);
 }`;
 
 const STAR_VERTEX = `#version 300 es
@@ -133,14 +138,51 @@ in float glow;
 out vec4 pixel;
 void main() { pixel = vec4(vec3(glow), 1.0); }`;
 
+// Grains of dust as soft points. Light is scattered once: exp(-t) of what is behind comes through.
+const DUST_VERTEX = `#version 300 es
+precision highp sampler2DShadow;
+layout(location = 0) in vec4 grain;   // place and spread, m
+layout(location = 1) in float area;   // cross-section, cm2
+uniform mat4 camera, light;
+uniform vec3 eye, sun;
+uniform vec4 cloud;                   // I/F of 1 over that of level soil; albedo, lobe and share thrown back (Regolith.cloud)
+uniform float focal;                  // pixels
+uniform sampler2DShadow shadows;
+out float thick, glow;
+float lobe(float towards) { return (1.0 - cloud.z * cloud.z) / pow(1.0 + cloud.z * cloud.z - 2.0 * cloud.z * towards, 1.5); }
+void main() {
+  gl_Position = camera * vec4(grain.xyz, 1.0);
+  float scale = focal / max(gl_Position.w, 0.01), sigma = clamp(grain.w * scale, 0.6, 20.0);
+  gl_PointSize = 6.0 * sigma;
+  thick = 1e-4 * area * scale * scale / (6.2831853 * sigma * sigma);
+  vec3 p = (light * vec4(grain.xyz, 1.0)).xyz;
+  float seen = max(abs(p.x), abs(p.y)) < 0.99 && p.z < 1.0 ? texture(shadows, p * 0.5 + 0.5) : 1.0;
+  float phase = dot(normalize(eye - grain.xyz), sun);
+  glow = seen * cloud.x * 0.125 * cloud.y * ((1.0 + cloud.w) * lobe(phase) + (1.0 - cloud.w) * lobe(-phase));
+}`;
+const DUST_FRAGMENT = `#version 300 es
+precision highp float;
+in float thick, glow;
+uniform vec3 colour, sun;
+uniform float exposure;
+out vec4 pixel;
+${SHOWN}
+void main() {
+  vec2 at = 6.0 * (gl_PointCoord - 0.5);
+  float t = thick * exp(-0.5 * dot(at, at));
+  pixel = vec4(shown(colour * (1.35 * exposure * sun.z * glow + 0.06)), 1.0 - exp(-t));
+}`;
+
 export class Renderer {
-  constructor(canvas, sun, exposure) {
+  constructor(canvas, sun, exposure, cloud) {
     const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "high-performance", preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2: use a recent Firefox, Chrome, Edge or Safari with graphics acceleration.");
-    Object.assign(this, { gl, canvas, sun, exposure });
+    Object.assign(this, { gl, canvas, sun, exposure, cloud });
     this.depth = this.program(DEPTH_VERTEX, DEPTH_FRAGMENT);
     this.surface = this.program(VERTEX, FRAGMENT);
     this.sky = this.program(STAR_VERTEX, STAR_FRAGMENT);
+    this.dust = this.program(DUST_VERTEX, DUST_FRAGMENT);
+    this.grains = this.grainField();
     this.stars = this.starField();
     this.shadowMap();
     this.trackMap();
@@ -205,6 +247,42 @@ export class Renderer {
     gl.vertexAttribPointer(0, 4, gl.FLOAT, false, 0, 0);
     gl.bindVertexArray(null);
     return { array, count: values.length / 4 };
+  }
+
+  grainField() {
+    const { gl } = this, array = gl.createVertexArray(), buffer = gl.createBuffer();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    [[4, 0], [1, 16]].forEach(([size, start], slot) => {
+      gl.enableVertexAttribArray(slot);
+      gl.vertexAttribPointer(slot, size, gl.FLOAT, false, 20, start);
+    });
+    gl.bindVertexArray(null);
+    return { array, buffer };
+  }
+
+  // grains: five numbers each; colour: of level ground; focal: pixels. The shadow map is bound already.
+  drawDust(grains, colour, focal, eye, camera, light) {
+    const { gl } = this, { at } = this.dust;
+    gl.useProgram(this.dust.made);
+    gl.uniformMatrix4fv(at.camera, false, camera);
+    gl.uniformMatrix4fv(at.light, false, light);
+    gl.uniform3fv(at.eye, eye);
+    gl.uniform3fv(at.sun, this.sun);
+    gl.uniform4fv(at.cloud, this.cloud);
+    gl.uniform1f(at.exposure, this.exposure);
+    gl.uniform3fv(at.colour, colour);
+    gl.uniform1f(at.focal, focal);
+    gl.uniform1i(at.shadows, 0);
+    gl.bindVertexArray(this.grains.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.grains.buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(grains), gl.DYNAMIC_DRAW);
+    gl.depthMask(false);   // grains hide no grains
+    gl.enable(gl.BLEND);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.drawArrays(gl.POINTS, 0, grains.length / 5);
+    gl.disable(gl.BLEND);
+    gl.depthMask(true);
   }
 
   shadowMap() {
@@ -278,8 +356,9 @@ export class Renderer {
     this.dirty.clear();
   }
 
-  // parts, ghosts: [{mesh, model, colour, kind}]; ghosts have an alpha too, and cast no shadow; centre: of what casts shadows; eye and camera: world to clip.
-  draw(parts, ghosts, centre, eye, camera) {
+  // parts, ghosts: [{mesh, model, colour, kind}]; ghosts have an alpha too, and cast no shadow; centre: of what casts shadows; eye and camera: world to clip;
+  // dust: {grains, colour, angle}, where angle is the height of the picture, rad.
+  draw(parts, ghosts, centre, eye, camera, dust) {
     const { gl, canvas } = this;
     this.flushTracks();
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
@@ -338,7 +417,10 @@ export class Renderer {
       }
     };
     each(parts);
+    if (dust.grains.length)
+      this.drawDust(dust.grains, dust.colour, 0.5 * h / Math.tan(0.5 * dust.angle), eye, camera, light);
     if (!ghosts.length) return;
+    gl.useProgram(this.surface.made);
     gl.colorMask(false, false, false, false);   // first how deep it is, so that only its nearest faces are blended
     each(ghosts);
     gl.colorMask(true, true, true, true);
