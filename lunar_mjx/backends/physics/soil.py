@@ -28,6 +28,8 @@ class ClosedForm:
     """Contact length, in radii, below which soil is too little touched to remember by how far it was sheared."""
     damped: float = 0.4
     """Share of J/dt that a wheel's damping by its sheared soil keeps below."""
+    stiff: float = 0.8
+    """Share of J/dt^2 that a wheel's stiffness by its sheared soil keeps below."""
 
 
 CLOSED_FORM = ClosedForm()
@@ -151,15 +153,21 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     """L dk/dt = v_slip - V_r k, exact over a step.
 
     L is the contact length times `relaxation`, and V_r the largest of |r omega|, |v_x| and, on soil, `creep`. The force
-    takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling. On soil the time
-    is cut to what an explicit step takes without shaking a wheel at rest.
+    takes k plus `damping_time` times its mean rate, faded by exp(-V_r damping_time/L) when rolling. On soil L is
+    lengthened and that time cut to what an explicit step takes without shaking a wheel at rest.
     """
     contact, r = c.contact, c.geometry["radius"]
     theta_1, theta_m = c.normal["entrance"], c.normal["theta_m"]
     # Plain differences: float64 has digits to spare, and the formula stays the source's.
     arc = np.maximum(r * (np.sin(theta_1) - np.sin(theta_m)), CLOSED_FORM.shortest * r)
     # rock has no arc in the ground over which shear could build up: bristles take the place of soil
-    length = np.where(c.soil["rock"] > 0.5, p.rock_length, p.relaxation * arc)
+    # soil that is stiffer than the drives' inertia takes in a step renews itself over a longer way
+    area = c.geometry["width"] * r * theta_1
+    stiffness = c.soil["cohesion"] * area + c.normal["load"] * c.soil["tan_phi"]
+    stiffness = stiffness * arc / c.soil["shear_modulus_x"]
+    most = np.min(largest_damping(c)[c.numbers.group == 0], initial=np.inf)
+    shortest = stiffness * r**2 * c.dt / (CLOSED_FORM.stiff * most)
+    length = np.where(c.soil["rock"] > 0.5, p.rock_length, np.maximum(p.relaxation * arc, shortest))
     roll = faster(contact["rim_speed"], contact["v_x"])
     speed = np.abs(roll)
     renewing = np.where(c.soil["rock"] > 0.5, speed, np.maximum(speed, p.creep))
@@ -169,12 +177,8 @@ def shear_state(c: Context, p: SimpleNamespace, state: Values) -> Values:
     # Divided by below; in float64 this is zero for all that matters.
     turned = np.maximum(share * c.dt, 1e-200)
     gain = -np.expm1(-turned) / turned / length
-    # soil that is stiffer than the drives' inertia takes in a step damps for a shorter time
-    area = c.geometry["width"] * r * theta_1
-    stiffness = c.soil["cohesion"] * area + c.normal["load"] * c.soil["tan_phi"]
-    stiffness = stiffness * arc / (c.soil["shear_modulus_x"] * length)
-    most = np.min(largest_damping(c)[c.numbers.group == 0], initial=np.inf)
-    longest = CLOSED_FORM.damped * most / np.maximum(stiffness * r**2, 1e-12)
+    # and damps for a shorter time
+    longest = CLOSED_FORM.damped * most * length / np.maximum(stiffness * r**2, 1e-12)
     damping_time = np.where(c.soil["rock"] > 0.5, p.damping_time, np.minimum(p.damping_time, longest))
     damped = damping_time * np.exp(-share * damping_time)
 

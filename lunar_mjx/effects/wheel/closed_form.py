@@ -35,6 +35,9 @@ class ContactLimits:
     damped: float = 0.4
     """1; most damping of a wheel by its sheared soil, over what stops it within a time step. The speed loop of a drive
     takes up to 0.8, and with 2 in all an explicit step shakes. Less would cut shipped rovers as they come."""
+    stiff: float = 0.8
+    """1; most stiffness of a wheel by its sheared soil, over what turns it back within a time step: an explicit step
+    shakes from 4 - 2 d on, d being the damping over what stops it within a step, up to 1.2 of soil and speed loop."""
 
 
 CONTACT = ContactLimits()
@@ -233,18 +236,20 @@ def shear_state(ctx, p, x, wheel):
     at rest is its slip speed over that speed: many simulators put such a floor under the slip's denominator. The same
     for (1 - s) tan(beta) of eq. 11, and for the direction in which the contact leans: that of rim and hub, their sum
     within V_r where they are opposed. Integrated exactly over a step, hence stable at any speed. The force takes k plus
-    `damping_time` times its rate; on soil for no longer than keeps a wheel at rest from shaking.
+    `damping_time` times its rate. On soil L is no shorter, and this time no longer, than keeps a wheel at rest from
+    shaking in steps of this length.
     """
     contact = ctx.contact
     rock = ctx.soil.rock > 0.5
     arc = jnp.maximum(contact_length(ctx, ctx.normal), CONTACT.shortest * ctx.geometry.radius)
-    length = jnp.where(rock, p.rock_length, p.relaxation * arc)
+    length, longest = _still_at_rest(ctx, arc, p.relaxation * arc)
+    length = jnp.where(rock, p.rock_length, length)
+    damping_time = jnp.where(rock, p.damping_time, jnp.minimum(p.damping_time, longest))
     # eq. 8 divides by the faster of rim and hub
     roll = jnp.where(jnp.abs(contact.rim_speed) > jnp.abs(contact.v_x), contact.rim_speed, contact.v_x)
     renewing = jnp.maximum(jnp.abs(roll), jnp.where(rock, 0.0, p.creep))
     # share of the way to the steady value, over the time that it would take at the first rate
     gained = mean_decay(renewing * ctx.dt / length) / length
-    damping_time = jnp.minimum(p.damping_time, _longest_damping_time(ctx, arc, length))
     held = jnp.exp(-renewing * damping_time / length)
     lifted = airborne(contact)
 
@@ -265,26 +270,25 @@ def shear_state(ctx, p, x, wheel):
     return wheel, {"slip_x": slip_x, "slip_y": slip_y, "direction": direction}
 
 
-def _longest_damping_time(ctx, arc, length):
-    """Damping time of sheared soil that an explicit step still takes, s: with a longer one a wheel at rest would shake.
+def _still_at_rest(ctx, arc, length):
+    """Distance, m, over which a contact on soil renews itself, and longest damping time, s, that explicit steps take.
 
-    A wheel's damping by its soil stays below a share of J/dt, J being the least inertia of a drive (see
-    `largest_damping`).
+    With a shorter distance, a stiffer spring, or a longer time a wheel at rest would shake: stiffness and damping by
+    its soil stay below a share of J/dt2 and J/dt, J being the least inertia of all drives (see `largest_damping`).
 
     Args:
-      arc: length of the contact, m. length: rolling distance over which it renews itself, m.
+      arc: length of the contact, m. length: that distance as it is given, m.
     """
     if ctx.rover.joint_inertia is None:
-        return jnp.inf
+        return length, jnp.inf
     soil, normal, radius = ctx.soil, ctx.normal, ctx.geometry.radius
     strength = soil.cohesion * ctx.geometry.width * radius * normal.entrance + normal.load * soil.tan_phi
-    # N per metre of rim, at first: a whole slip displaces the soil of the contact by about the contact's length
-    stiffness = strength * arc / (soil.shear_modulus_x * length)
-    # the least of all drives, as for the gains
+    # J per metre of rim, at first: a whole slip displaces the soil of the contact by about the contact's length
+    stiffness = radius**2 * strength * arc / soil.shear_modulus_x
     most = jnp.min(jnp.where(ctx.rover.joint_group == 0, largest_damping(ctx), jnp.inf))
+    length = jnp.maximum(length, stiffness * ctx.dt / (CONTACT.stiff * most))
     # not smaller: the derivative divides by the square, which float32 has to hold
-    longest = CONTACT.damped * most / jnp.maximum(stiffness * radius**2, 1e-12)
-    return jnp.where(soil.rock > 0.5, jnp.inf, longest)
+    return length, CONTACT.damped * most * length / jnp.maximum(stiffness, 1e-12)
 
 
 def lateral_slip_speed(contact):
