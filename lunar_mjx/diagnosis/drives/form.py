@@ -88,7 +88,10 @@ class DriveForm(MeasuredForm):
         self._signatures = Signatures(drives, derivatives, design, prior, errors, settings, progress)
         self._own = OwnRefit(drives, derivatives, design, self._signatures, descent, prior, errors, settings, progress)
         linearised = Linearised(prior, errors, design, settings)
-        self._refits = Refits(drives, design, linearised, descent, prior, errors, self.terms, settings)
+        acting = super().trial
+        self._refits = Refits(
+            drives, design, linearised, descent, prior, errors, self.terms, settings, self._own, acting
+        )
 
     @property
     def parts(self) -> list[list[str]]:

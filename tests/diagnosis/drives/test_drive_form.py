@@ -23,6 +23,7 @@ from lunar_mjx.diagnosis.drives.refitting.descent import Descent
 from lunar_mjx.diagnosis.drives.refitting.fields import USUAL_EFFECTS, Share
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
 from lunar_mjx.diagnosis.drives.refitting.own import OwnRefit
+from lunar_mjx.diagnosis.drives.refitting.refits import Refits
 from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.usual import acting_current
@@ -138,8 +139,44 @@ def test_a_descent_ends_where_jumps_hide_what_its_slopes_promise():
     assert toy.rows < 200
     assert base.u[:2] == pytest.approx([1.5, -0.8], abs=0.3)
     toy.rows = 0
+    form._refits.begun.add(frozenset({"drag"}))  # not from the model as given, too
     form.refit(frozenset({"drag"}), base, None)
     assert toy.rows < 100
+
+
+def test_a_set_is_refitted_from_the_model_as_given_too_with_errors_of_its_own(monkeypatch):
+    """The model as it is makes up for what it lacks; the more probable of both ends counts, and nothing else stays."""
+    form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    ends, begun, refit, approach = [], [], Refits._refit, OwnRefit.approach
+    monkeypatch.setattr(Refits, "_refit", lambda *a, **k: (ends.append(refit(*a, **k)), ends[-1])[1])
+    monkeypatch.setattr(OwnRefit, "approach", lambda self, u, *a: (begun.append(u), approach(self, u, *a))[1])
+    errors, seen, steps = form.errors, form._refits.design.seen.copy(), form._derivatives.steps.copy()
+    drag = frozenset({"drag"})
+    found = form.refit(drag, base, form.trial(base.u, "drag"))
+    assert len(ends) == 2 and len(begun) == 1
+    # the model's own parameters as given, the effect where the first side has ended
+    assert begun[0][:2] == pytest.approx([0.0, 0.0]) and begun[0][2] == pytest.approx(ends[0][0][2])
+    assert begun[0][2] > 1.0
+    values = [linear.evidence(form.listed(drag))[0] for _, linear in ends]
+    assert found.u is ends[int(np.argmax(values))][0]
+    assert form.errors is errors and np.array_equal(form._derivatives.steps, steps)
+    assert np.array_equal(form._refits.design.seen, seen)
+    form.refit(drag, base, None)
+    assert len(ends) == 3 and len(begun) == 1
+
+
+def test_without_time_for_the_second_side_the_first_counts(monkeypatch):
+    form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+
+    def late(*_):
+        raise TimeUp
+
+    monkeypatch.setattr(OwnRefit, "approach", late)
+    errors = form.errors
+    refit = form.refit(frozenset({"drag"}), base, form.trial(base.u, "drag"))
+    assert refit.u[2] > 1.0 and form.errors is errors
 
 
 class Faint(Toy):
@@ -901,5 +938,6 @@ def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
         return linear(self, u, *rest)
 
     monkeypatch.setattr(Linearised, "around", steep_again)
+    form._refits.begun.add(frozenset({"drag"}))  # not from the model as given, too
     refit = form.refit(frozenset({"drag"}), base, None)
     assert len(told) == 2 and refit.u is told[0]

@@ -15,7 +15,11 @@ from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
 
 
 class Derivatives:
-    """Derivatives of drives' predictions by their coordinates, per scale."""
+    """Derivatives of drives' predictions by their coordinates, per scale.
+
+    Attributes:
+      steps: (coordinates,) over which they are taken, in scales.
+    """
 
     def __init__(self, drives: DriveProblem, prior: Prior, errors: ErrorModel):
         """Makes them.
@@ -25,15 +29,15 @@ class Derivatives:
         """
         self._drives, self._prior, self._errors = drives, prior, errors
         places = prior.places
-        # (coordinates,) steps of derivatives, in scales. Inputs act on every reading, at all times: to first order in a
+        # Inputs act on every reading, at all times: to first order in a
         # fiftieth of what is usual a jump of a reading is little, where over a short step it is a slope of thousands.
         own = [FROM_NOTHING.get(c.effect, {}).get(c.name, (0.0, 0.0, STEP))[2] for c in places.coordinates]
-        self._steps = np.array(own)
-        self._steps[places.discrepancy] = DRIVE_REFIT.input_step * prior.whole_size
+        self.steps = np.array(own)
+        self.steps[places.discrepancy] = DRIVE_REFIT.input_step * prior.whole_size
 
     def step_over(self, which: np.ndarray, steps: np.ndarray) -> None:
         """Takes derivatives by some coordinates over steps (which,), in scales, from now on."""
-        self._steps[which] = steps
+        self.steps[which] = steps
 
     def jacobian(self, u: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predictions (n,) at (coordinates,) and their derivatives (n, free).
@@ -42,11 +46,11 @@ class Derivatives:
         stand in it as knowledge. Where a slope says so much, the one to the other side is taken as well, and of each
         reading's two the flatter: the other has the jump.
         """
-        value, slopes = self._drives.jacobian(u, free, steps=self._steps)
+        value, slopes = self._drives.jacobian(u, free, steps=self.steps)
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)
         steep = self._steep(slopes, free)
         if len(steep):
-            other = self._drives.jacobian(u, free[steep], side=-1, steps=self._steps)[1]
+            other = self._drives.jacobian(u, free[steep], side=-1, steps=self.steps)[1]
             slopes[:, steep] = flatter(slopes[:, steep], other)
         return value, slopes
 

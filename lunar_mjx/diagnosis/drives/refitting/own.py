@@ -102,17 +102,7 @@ class OwnRefit:
         elif self._take_kept(start, kept):
             u, arrived = start, False
         else:
-            self.errors.forget(self.drives.observations)
-            # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after
-            # it, and a descent that moves everything at once follows them into soil that nothing brings it back from.
-            nuisances = free[[places.coordinates[i].nuisance and self.prior.field_of[i] < 0 for i in free]]
-            u = self.descent.descend(start, nuisances)[0]
-            # Ground before soil: waves that nobody mapped cost a rover more torque than a few per cent of the soil's
-            # constants do, which would follow them.
-            if len(places.own_ground):
-                usual = self.prior.fields.usual, self.errors.stated_noise
-                u = self.descent.descend(u, np.concatenate([nuisances, places.own_ground]), usual)[0]
-            u, sizes = self.approach(u, free, sizes, learns)
+            u, sizes = self.approach(self._begin(start, free), free, sizes, learns)
             if self.drives.noise_unlearnt:
                 self.drives.learn_noise(u)
                 self.errors.forget(self.drives.observations)
@@ -122,14 +112,61 @@ class OwnRefit:
             self.signatures.see(u)
         if not arrived:
             # with a little of every effect among what is usual
-            u, sizes = self.approach(u, free, sizes, learns)
+            u, sizes = self.approach(u, free, sizes, learns, SETTLES)
         slopes = self.signatures.look(u, free)
         assert sizes is not None
         if places.candidates:
             self.signatures.choose(self.design.columns(u, free, slopes), sizes)
         return Base(u, free, slopes, sizes)
 
-    def approach(self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool) -> tuple[np.ndarray, Sizes]:
+    def anew(self, effects: frozenset[str], start: np.ndarray, base: Base) -> np.ndarray:
+        """Where (coordinates,) the model with some effects ends on the way that the model as it is was refitted.
+
+        The model as it is makes up for what it lacks by all else that it has, and takes what remains for errors: from
+        there, and by these errors, an effect has often nothing to gain. Here errors are its own, and large at first;
+        afterwards they are again those with which all hypotheses are weighed, with the derivatives at the base.
+
+        Args:
+          effects: of the model. start: (coordinates,) where they act, with the model's own parameters as given.
+          base: the refit of the model as it is.
+
+        Raises:
+          EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at.
+        """
+        errors, free = self.errors, self.prior.places.free(effects)
+        kept = errors.present, errors.channels_held
+        seen, steps = self.design.seen.copy(), self.derivatives.steps.copy()
+        try:
+            return self.approach(self._begin(start, free), free, None, True, SETTLES)[0]
+        finally:
+            errors.present, errors.channels_held = kept
+            self.design.seen, self.derivatives.steps = seen, steps
+            self.drives.about(base.u)
+
+    def _begin(self, start: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Where (coordinates,) instruments, starts of logs and unmapped ground are when all else is as at the start.
+
+        Errors of readings begin anew.
+
+        Args:
+          start: (coordinates,) where from. free: coordinates that a refit moves.
+        """
+        places = self.prior.places
+        self.errors.forget(self.drives.observations)
+        # Instruments first: currents that are read before a command's jump differ by thirty sigma from those after
+        # it, and a descent that moves everything at once follows them into soil that nothing brings it back from.
+        nuisances = free[[places.coordinates[i].nuisance and self.prior.field_of[i] < 0 for i in free]]
+        u = self.descent.descend(start, nuisances)[0]
+        # Ground before soil: waves that nobody mapped cost a rover more torque than a few per cent of the soil's
+        # constants do, which would follow them.
+        if len(places.own_ground):
+            usual = self.prior.fields.usual, self.errors.stated_noise
+            u = self.descent.descend(u, np.concatenate([nuisances, places.own_ground]), usual)[0]
+        return u
+
+    def approach(
+        self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool, last: int = ENDS
+    ) -> tuple[np.ndarray, Sizes]:
         """Where (coordinates,) the evidence of the model as it is is highest, and sizes of there; errors are learnt.
 
         They are learnt at every Jacobian: at a poor place they are large, and a descent that kept them would end there.
@@ -140,6 +177,7 @@ class OwnRefit:
           u: where from. free: places of what moves. begun: sizes that were found near there, or None.
           learns: whether errors of single readings are learnt; a rival is weighed against measurements with the very
             errors of the model's own form.
+          last: the stage with which it ends.
 
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at.
@@ -174,7 +212,7 @@ class OwnRefit:
                     if stage == ANEW:
                         self.errors.learn_single(learnt)
                     continue
-                if stage == ENDS:
+                if stage == last:
                     break
                 (_, u, self.errors.present, sizes, slopes), idle, stage = best, 0, stage + 1 if learns else ENDS
                 looks = DRIVE_REFIT.most_looks  # its derivatives are known

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,10 +14,11 @@ from lunar_mjx.diagnosis.drives.refitting.design import Design
 from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel
 from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
-from lunar_mjx.diagnosis.drives.refitting.own import Base
+from lunar_mjx.diagnosis.drives.refitting.own import Base, OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.prior import Prior
 from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
+from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Refit, Term
 
@@ -29,9 +30,11 @@ class Refits:
     Attributes:
       drives: simulation. design: derivatives. linearised: what hypotheses need. descent: within bounds.
       prior: of what moves. errors: of the readings. terms: everything that may be the matter. settings: effort.
+      own: refit of the model as it is. acting: the place (coordinates,) of another with an effect of some size.
       base: the refit of the model as it is by itself; None before.
       ended: (coordinates,) where that refit has ended.
       slopes: coordinates and derivatives (n, free) by them at the end of each refit, by its effects.
+      begun: sets of effects that were refitted from the model as given.
     """
 
     drives: DriveProblem
@@ -42,9 +45,12 @@ class Refits:
     errors: ErrorModel
     terms: Sequence[Term]
     settings: DriveSettings
+    own: OwnRefit
+    acting: Callable[[np.ndarray, str], np.ndarray]
     base: Base | None = None
     ended: np.ndarray | None = None
     slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    begun: set[frozenset[str]] = dataclasses.field(default_factory=set)
 
     def begin(self, base: Base) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model as it is ends from its own refit, and what hypotheses need there.
@@ -66,13 +72,34 @@ class Refits:
     ) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
 
+        Each set of effects is refitted from two sides: from a similar refit, and once from the model as given (see
+        `OwnRefit.anew`). The more probable end counts; where the time cuts the second one short, the first.
+
         Args:
           effects, near, start: as for `Form.refit`. trial: whether an effect acts at the start whatever that costs.
 
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before the refit had ended.
         """
-        return self._refit(effects, near, start, trial)
+        assert self.base is not None
+        first = self._refit(effects, near, start, trial)
+        if not effects or effects in self.begun:
+            return first
+        self.begun.add(effects)
+        ended = self.slopes[effects]
+        given = self.prior.as_given()
+        own = [i for e in effects for i in self.prior.places.candidates[e]]
+        given[own] = first[0][own]
+        for effect in sorted(effects):
+            given = self.acting(given, effect)
+        try:
+            second = self._refit(effects, near, self.own.anew(effects, given, self.base), trial=True)
+        except (EvidenceError, TimeUp):
+            return first
+        best = max(first, second, key=lambda end: end[1].evidence(self._listed(effects))[0])
+        if best is first:
+            self.slopes[effects] = ended
+        return best
 
     def _refit(
         self,
