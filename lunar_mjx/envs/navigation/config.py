@@ -108,7 +108,7 @@ class NavigationConfig:
     camera_pitch_deg: float = FRONT_MOUNT.pitch_deg
     camera_far: float = 60.0
     camera_lens: tuple[float, ...] = ()
-    camera_dust: bool = True
+    camera_dust: bool = False
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
     delay: float = 0.0
