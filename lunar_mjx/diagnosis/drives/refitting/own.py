@@ -203,7 +203,7 @@ class OwnRefit:
                 # Smaller errors promise more of the same slopes: one place without a gain may lie on the way.
                 idle = idle + 1 if gained < 0.5 * settings.settled else 0
                 stage = SETTLES_AGAIN if stage == ENDS and not idle else stage
-                self.progress("refitting the model as it is", math.nan)
+                self.progress("refitting, and learning errors of readings", math.nan)
                 if idle <= DRIVE_REFIT.most_idle:
                     there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
                     damping = min(there.damping, DRIVE_REFIT.renewed_damping)
