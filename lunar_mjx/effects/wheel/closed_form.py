@@ -283,7 +283,7 @@ def _still_at_rest(ctx, arc, length):
         return length, jnp.inf
     soil, normal, radius = ctx.soil, ctx.normal, ctx.geometry.radius
     strength = soil.cohesion * ctx.geometry.width * radius * normal.entrance + normal.load * soil.tan_phi
-    # J per metre of rim, at first: a whole slip displaces the soil of the contact by about the contact's length
+    # N m per rad, times the distance, at first: a whole slip displaces the soil of a contact by about its length
     stiffness = radius**2 * strength * arc / soil.shear_modulus_x
     most = jnp.min(jnp.where(ctx.rover.joint_group == 0, largest_damping(ctx), jnp.inf))
     length = jnp.maximum(length, stiffness * ctx.dt / (CONTACT.stiff * most))

@@ -151,6 +151,8 @@ def test_a_set_is_refitted_from_the_model_as_given_too_with_errors_of_its_own(mo
     ends, begun, refit, approach = [], [], Refits._refit, OwnRefit.approach
     monkeypatch.setattr(Refits, "_refit", lambda *a, **k: (ends.append(refit(*a, **k)), ends[-1])[1])
     monkeypatch.setattr(OwnRefit, "approach", lambda self, u, *a: (begun.append(u), approach(self, u, *a))[1])
+    about: list[np.ndarray] = []
+    monkeypatch.setattr(form.drives, "about", about.append)
     errors, seen, steps = form.errors, form._refits.design.seen.copy(), form._derivatives.steps.copy()
     drag = frozenset({"drag"})
     found = form.refit(drag, base, form.trial(base.u, "drag"))
@@ -161,22 +163,33 @@ def test_a_set_is_refitted_from_the_model_as_given_too_with_errors_of_its_own(mo
     values = [linear.evidence(form.listed(drag))[0] for _, linear in ends]
     assert found.u is ends[int(np.argmax(values))][0]
     assert form.errors is errors and np.array_equal(form._derivatives.steps, steps)
+    assert about[-1] is form._refits.base.u
     assert np.array_equal(form._refits.design.seen, seen)
     form.refit(drag, base, None)
     assert len(ends) == 3 and len(begun) == 1
 
 
-def test_without_time_for_the_second_side_the_first_counts(monkeypatch):
+@pytest.mark.parametrize("failure", [TimeUp, np.linalg.LinAlgError, EvidenceError])
+@pytest.mark.parametrize("place", ["approach", "_refit"])
+def test_a_second_side_that_is_late_or_fails_leaves_the_first(monkeypatch, failure, place):
     form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
 
-    def late(*_):
-        raise TimeUp
+    ends, refit = [], Refits._refit
 
-    monkeypatch.setattr(OwnRefit, "approach", late)
-    errors = form.errors
-    refit = form.refit(frozenset({"drag"}), base, form.trial(base.u, "drag"))
-    assert refit.u[2] > 1.0 and form.errors is errors
+    def late(*a, **k):
+        if place == "approach" or ends:
+            raise failure
+        ends.append(refit(*a, **k))
+        return ends[0]
+
+    monkeypatch.setattr(OwnRefit if place == "approach" else Refits, place, late)
+    errors, drag = form.errors, frozenset({"drag"})
+    found = form.refit(drag, base, form.trial(base.u, "drag"))
+    assert found.u[2] > 1.0 and form.errors is errors and form._errors.channels_held is False
+    if ends:
+        assert found.u is ends[0][0]
+    assert len(form._refits.slopes[drag][0]) == len(form._own.prior.places.free(drag))
 
 
 class Faint(Toy):

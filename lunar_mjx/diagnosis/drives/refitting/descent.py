@@ -115,8 +115,7 @@ class Descent:
         weight = 1.0 / noise[errors.group[fit]]
         misfit = np.zeros((len(weight), 0))
         if sizes is not None and inputs is not None:
-            effects = frozenset(e for e, own in places.candidates.items() if own[0] in free)
-            columns, field = self._design.fields(inputs, effects)
+            columns, field = self._design.fields(inputs, places.effects(free))
             misfit = observations.whiten(columns)[fit] * sizes[0][field] * weight[:, None]
         std = self._prior.std if sizes is None else self._prior.sized(sizes[0])
         std = students_std(places.coordinates, places.candidates, u, std, self._settings.effect_freedom)

@@ -94,7 +94,7 @@ class OwnRefit:
           TimeUp: before the refit had ended; it counts from wherever it has come.
         """
         places = self.prior.places
-        free, arrived, sizes = places.free(), not places.candidates, None
+        free, arrived, sizes, last = places.free(), not places.candidates, None, SETTLES
         learns = beside is None
         if beside is not None:
             start = self._begin_beside(beside)
@@ -106,13 +106,14 @@ class OwnRefit:
             if self.drives.noise_unlearnt:
                 self.drives.learn_noise(u)
                 self.errors.forget(self.drives.observations)
-                arrived, sizes = False, None
+                arrived, sizes, last = False, None, ENDS
         if places.candidates:
             self.signatures.look(u, free)
             self.signatures.see(u)
         if not arrived:
-            # with a little of every effect among what is usual
-            u, sizes = self.approach(u, free, sizes, learns, SETTLES)
+            # With a little of every effect among what is usual, which changes little of where it ends; with noise that
+            # has just been learnt it is the first refit.
+            u, sizes = self.approach(u, free, sizes, learns, last)
         slopes = self.signatures.look(u, free)
         assert sizes is not None
         if places.candidates:
@@ -259,7 +260,8 @@ class OwnRefit:
           u: (coordinates,) the place. free: coordinates, discrepancy among them. slopes: (n, free) derivatives there.
           begun: sizes near there, or None.
         """
-        columns, fields = self.design.columns(u, free, slopes), self.prior.fields
+        effects = self.prior.places.effects(free)
+        columns, fields = self.design.columns(u, free, slopes, effects), self.prior.fields
         derivatives, prior = self.design.of_the_model(columns, free)
         learnt = self.errors.learn(derivatives, columns.residual, prior, fields.priors(bounded=True), begun)
         # Slopes by inputs are to hold as far as these may still be off; over shorter steps single readings jump. (Of 31

@@ -55,6 +55,10 @@ class Places:
         own = [places for name, places in self.candidates.items() if name in effects]
         return np.concatenate([self.baseline, self.own_ground, self.discrepancy, *own])
 
+    def effects(self, free: np.ndarray) -> frozenset[str]:
+        """Effects that a refit has that moves some coordinates."""
+        return frozenset(e for e, own in self.candidates.items() if own[0] in free)
+
     def amplitudes(self, effects: Iterable[str]) -> np.ndarray:
         """Places of the amplitudes of some effects, without their shapes."""
         return np.array([i for e in effects for i in self.candidates[e] if self.coordinates[i].amplitude], int)

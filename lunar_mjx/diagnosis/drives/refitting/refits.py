@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -82,6 +83,7 @@ class Refits:
           EvidenceError: nothing can be told of where it begins. TimeUp: before the refit had ended.
         """
         assert self.base is not None
+        base = self.base
         first = self._refit(effects, near, start, trial)
         if not effects or effects in self.begun:
             return first
@@ -92,11 +94,11 @@ class Refits:
         given[own] = first[0][own]
         for effect in sorted(effects):
             given = self.acting(given, effect)
-        try:
-            second = self._refit(effects, near, self.own.anew(effects, given, self.base), trial=True)
-        except (EvidenceError, TimeUp):
-            return first
-        best = max(first, second, key=lambda end: end[1].evidence(self._listed(effects))[0])
+        terms, best = self._listed(effects), first
+        # What fails or is late on the second side says nothing against the first.
+        with contextlib.suppress(EvidenceError, TimeUp, ValueError, np.linalg.LinAlgError):
+            second = self._refit(effects, near, self.own.anew(effects, given, base), trial=True)
+            best = max(first, second, key=lambda end: end[1].evidence(terms, base.sizes)[0])
         if best is first:
             self.slopes[effects] = ended
         return best
