@@ -124,7 +124,7 @@ class OwnRefit:
         """Where (coordinates,) the model with some effects ends on the way that the model as it is was refitted.
 
         The model as it is makes up for what it lacks by all else that it has, and takes what remains for errors: from
-        there, and by these errors, an effect has often nothing to gain. Here errors are its own, and large at first;
+        there, and by these errors, an effect may have nothing to gain. Here errors are its own, and large at first;
         afterwards they are again those with which all hypotheses are weighed, with the derivatives at the base.
 
         Args:
