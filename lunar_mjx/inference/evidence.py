@@ -470,34 +470,38 @@ def infer(
     # from far behind a wall Newton's method would come back by a thirtieth a step
     bounded = np.flatnonzero([f.bounded for f in fields])
     x[bounded] = np.minimum(x[bounded], np.log(usual[bounded]))
-    here = _density(x, gram, amplitudes, fields, noises)
+    here, exact = _density(x, gram, amplitudes, fields, noises, exact=False), False
     promised = np.inf
     for _ in range(SIZE_DESCENT.most_steps):
         step = _newton_step(here)
         # What the quadratic model gains: gradient times step, less the half of it that the curvature takes back.
         promised = 0.5 * float(here.gradient @ step)
-        if promised < SIZE_DESCENT.settled:
+        ends = promised < SIZE_DESCENT.settled
+        if not ends:
+            # in the logarithms a long step leaves the region in which the density is near its quadratic
+            step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
+            for _ in range(30):
+                try:
+                    there = _density(x + step, gram, amplitudes, fields, noises, exact)
+                except EvidenceError:
+                    there = None  # sizes at which rounding spoils the density are no place to go to
+                if there is not None and there.value >= here.value:
+                    break
+                step *= 0.5
+            else:
+                there = None  # no step gains: rounding is reached
+            ends = there is None or there.value - here.value < SIZE_DESCENT.settled
+            if there is not None:
+                x, here = x + step, there
+        if ends and exact:
             break
-        # in the logarithms a long step leaves the region in which the density is near its quadratic
-        step *= min(1.0, SIZE_DESCENT.longest / max(float(np.abs(step).max()), 1e-300))
-        for _ in range(30):
-            try:
-                there = _density(x + step, gram, amplitudes, fields, noises)
-            except EvidenceError:
-                there = None  # sizes at which rounding spoils the density are no place to go to
-            if there is not None and there.value >= here.value:
-                break
-            step *= 0.5
-        else:
-            break  # no step gains: rounding is reached
-        assert there is not None
-        gained = there.value - here.value
-        x, here = x + step, there
-        if gained < SIZE_DESCENT.settled:
-            break
+        if ends:
+            # A tenth of the time of exact second derivatives leads to where they are needed.
+            here, exact = _density(x, gram, amplitudes, fields, noises), True
     else:
         if promised > SIZE_DESCENT.bearable:
             raise EvidenceError(f"sizes of discrepancy and noise did not settle: a step still promises {promised:.2g}")
+        here = _density(x, gram, amplitudes, fields, noises)
     # a size is never taken to be known worse than to a factor of 20: Laplace's volume would have no end there
     hessian = _positive(here.hessian)
     log_evidence = here.value + 0.5 * len(x) * _LOG_2PI - 0.5 * float(np.linalg.slogdet(hessian)[1])
@@ -605,7 +609,7 @@ def _condition(
     scale = amplitudes.std * np.append(tau, 1.0)[amplitudes.field]  # field -1 picks the 1 at the end
     # Noise factors enter here, after the measurements have been summed: trying other sizes costs nothing in their
     # number.
-    whole = np.einsum("g,gij->ij", 1.0 / noise**2, gram.matrix)
+    whole = (noise**-2.0 @ gram.matrix.reshape(len(noise), -1)).reshape(k + 1, k + 1)
     inner, across = whole[:k, :k], whole[:k, k]
     # Counted from the refit, where residuals are small. From the prior's mean, steep slopes would make the residual a
     # million sigma long, and rounding would leave its chi-square uncertain by hundreds.
@@ -632,9 +636,17 @@ def _condition(
 
 
 def _density(
-    x: np.ndarray, gram: Gram, amplitudes: Amplitudes, fields: Sequence[Field], noises: Sequence[NoiseSize]
+    x: np.ndarray,
+    gram: Gram,
+    amplitudes: Amplitudes,
+    fields: Sequence[Field],
+    noises: Sequence[NoiseSize],
+    exact: bool = True,
 ) -> _At:
-    """Log density of measurements and log sizes together, with exact first and second derivatives.
+    """Log density of measurements and log sizes together, with exact first derivatives.
+
+    Second derivatives are exact, or nearly so where they need not be: traces of products of two filters, which take
+    most of the time, are then those of filters that let through or hold back and have nothing in common.
 
     With V the covariance of the measurements, V_i its derivative by a log size (V_ii = 2 V_i) and q = V^-1 r:
     gradient_i = (q V_i q - tr V^-1 V_i)/2; -Hessian_ij = q V_i V^-1 V_j q - tr(V^-1 V_i V^-1 V_j)/2, and on the
@@ -653,15 +665,15 @@ def _density(
     power = np.empty(many + groups)
     trace[:many], power[:many] = member @ np.diag(absorbed), member @ mean**2
     weight = mean[:, None] * member.T  # (k, fields): V^-1/2 of each field's share, in standardised amplitudes
-    own = np.empty((k, groups))
-    seen = scale[:, None] * gram.matrix[:, :k, :k] * scale / noise[:, None, None] ** 2
-    filtered = inverse @ seen
-    for c in range(groups):
-        a = gram.matrix[c]
-        left = a[:k, k] - a[:k, :k] @ place
-        own[:, c] = scale * left / noise[c] ** 2
-        power[many + c] = (a[k, k] - place @ a[:k, k] - place @ left) / noise[c] ** 2
-        trace[many + c] = gram.count[c] - np.trace(filtered[c])
+    # (groups, k + 1): of each group what the amplitudes leave, seen along its columns; its own square comes last
+    left = gram.matrix @ np.append(-place, 1.0)
+    own = scale[:, None] * left[:, :k].T / noise**2
+    power[many:] = (left[:, k] - left[:, :k] @ place) / noise**2
+    # Traces of the filters: sums of products with the posterior covariance.
+    covariance = np.zeros((k + 1, k + 1))
+    covariance[:k, :k] = scale[:, None] * inverse * scale
+    passed = gram.matrix.reshape(groups, -1) @ covariance.ravel() / noise**2
+    trace[many:] = gram.count - passed
     quadratic = np.empty((many + groups, many + groups))
     traces = np.empty_like(quadratic)
     back = inverse @ own
@@ -670,13 +682,18 @@ def _density(
     quadratic[many:, many:] = np.diag(power[many:]) - own.T @ back
     # The trace of a product of two blocks of a symmetric matrix is the sum of its squared entries between them.
     traces[:many, :many] = member @ absorbed**2 @ member.T
-    # Traces of products of two filters: one product of matrices whose rows are the filters' entries.
-    traces[many:, many:] = filtered.reshape(groups, k * k) @ filtered.transpose(0, 2, 1).reshape(groups, k * k).T
-    traces[:many, many:] = member @ np.einsum("gij,ij->gi", filtered, inverse).T
+    if exact:
+        # Traces of products of two filters: one product of matrices whose rows are the filters' entries.
+        seen = scale[:, None] * gram.matrix[:, :k, :k] * scale / noise[:, None, None] ** 2
+        filtered = inverse @ seen
+        traces[many:, many:] = filtered.reshape(groups, k * k) @ filtered.transpose(0, 2, 1).reshape(groups, k * k).T
+        traces[:many, many:] = member @ np.einsum("gij,ij->gi", filtered, inverse).T
+    else:
+        traces[many:, many:], traces[:many, many:] = np.diag(passed), 0.0
     for c in range(groups):
         # V^-1 V_c is the identity less the filter; squared, it leaves the count less twice the filter's trace, beside
         # the above.
-        traces[many + c, many + c] += gram.count[c] - 2.0 * np.trace(filtered[c])
+        traces[many + c, many + c] += gram.count[c] - 2.0 * passed[c]
     quadratic[many:, :many], traces[many:, :many] = quadratic[:many, many:].T, traces[:many, many:].T
     gradient = power - trace
     hessian = 4.0 * quadratic - 2.0 * traces + np.diag(2.0 * (trace - power))
@@ -706,7 +723,7 @@ def _density(
             value -= 0.5 * (x[i] / prior.log_std) ** 2 + math.log(prior.log_std) + 0.5 * _LOG_2PI
             gradient[i] -= x[i] / prior.log_std**2
             hessian[i, i] += 1.0 / prior.log_std**2
-    return _At(value, gradient, hessian, place, scale[:, None] * inverse * scale)
+    return _At(value, gradient, hessian, place, covariance[:k, :k])
 
 
 def _log_inverse_chi(x: float, freedom: float) -> tuple[float, float, float]:
