@@ -45,7 +45,13 @@ def build_drives(
     settings = DriveSettings.of(run.settings)
     wanted = candidates_of(run, only) if candidates is None else candidates
     model = with_nominal_controller(run.model)
-    drives = DriveProblem(logs, model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
+
+    def problem_of(model: Model) -> DriveProblem:
+        return DriveProblem(
+            logs, model, wanted, run.splits, progress=progress, discrepancy=run.discrepancy, span=settings.span
+        )
+
+    drives = problem_of(model)
     form = DriveForm(drives, settings, progress)
     # what was kept of a model whose controllers followed its motors is another model's
     kept = kept_start(run, form, frozenset()) if model is run.model else None
@@ -59,7 +65,7 @@ def build_drives(
         raise bad_input("settings", "laws", ", ".join(settings.laws), problem, "leave it away")
     # the closed form is an approximation of the others: beside one of these it is no rival
     for law in [name for name in laws if rivals and own == CLOSED_FORM and name != own]:
-        beside = DriveProblem(logs, laws[law], wanted, run.splits, progress=progress, discrepancy=run.discrepancy)
+        beside = problem_of(laws[law])
         forms.append(DriveForm(beside, settings, progress, law, form))
     for one, prior in zip(forms, log_shares(len(forms)), strict=True):
         one.log_prior = prior

@@ -24,6 +24,7 @@ from lunar_mjx.diagnosis.drives.instruments import (
     usual_errors,
     usual_nuisances,
 )
+from lunar_mjx.diagnosis.drives.means import Means
 from lunar_mjx.diagnosis.drives.noise import Noises
 from lunar_mjx.diagnosis.drives.nuisances import (
     STANDING,
@@ -40,7 +41,13 @@ from lunar_mjx.diagnosis.drives.observations import observations_of, with_discre
 from lunar_mjx.diagnosis.drives.simulation.log_run import STOOD
 from lunar_mjx.diagnosis.drives.simulation.program import Rows
 from lunar_mjx.diagnosis.drives.simulation.rollouts import Bench, at_once, jumps
-from lunar_mjx.diagnosis.drives.simulation.simulated_rows import Key, Simulated, keys_of_rows, stamp_of_observations
+from lunar_mjx.diagnosis.drives.simulation.simulated_rows import (
+    Key,
+    Simulated,
+    keys_of_rows,
+    stamp,
+    stamp_of_observations,
+)
 from lunar_mjx.diagnosis.drives.simulation.unmapped_ground import ground_coordinates
 from lunar_mjx.diagnosis.drives.unused import unused_sentence
 from lunar_mjx.diagnosis.effect_coordinates import of_candidate
@@ -82,6 +89,7 @@ class DriveProblem:
         engine: str = "auto",
         progress: Progress = silent,
         discrepancy: Mapping[str, float] | None = None,
+        span: float = 0.0,
     ):
         """Makes the problem.
 
@@ -96,6 +104,7 @@ class DriveProblem:
           engine: of the dynamics.
           progress: told of every chunk.
           discrepancy: known unexplained error of the model by channel, in its unit; a name may hold `*`.
+          span: over which readings are averaged, s; 0 for every reading by itself.
 
         Raises:
           UserError: a discrepancy of a channel that is not compared.
@@ -110,10 +119,11 @@ class DriveProblem:
         self._stamped: tuple[Observations | None, bytes] = None, b""
         coordinates = baseline_coordinates(model, baseline)
         self._noises = Noises(self.logs)
-        self._noise_alone = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
+        self._readings = observations_of(self.bench, self.logs, splits or {}, channels, self._noises)
+        self._means = Means(self._readings, span, [run.begin for run in self.bench.runs])
         self._rate: np.ndarray | None = None
-        self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
-        self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self._noise_alone.series)
+        self.observations = self._averaged()
+        self.noise_unlearnt = any(s.correlation_time > 0.0 for s in self._readings.series)
         shows = self._standing_shows()
         coordinates.append(step_error_share())
         if any(at_once(s.channel) for s in self.observations.series):
@@ -186,21 +196,30 @@ class DriveProblem:
         seen = [row for k in keys if (row := SIMULATED.get(k)) is not None]
         if len(seen) < len(keys):
             values = {(NUISANCE, STOOD, n, False): np.array(STANDING) for n in sloped}
-            seen = list(self._run(self.bench, len(keys), values, silent))
+            seen = list(self._means(self._run(self.bench, len(keys), values, silent)))
             for k, row in zip(keys, seen, strict=True):
                 SIMULATED.keep(k, row)
         return frozenset(n for n in sloped if standing_shows(seen[1] - seen[0], n, self.observations))
 
     def learn_noise(self, u: np.ndarray) -> None:
         """Takes the noise's colour anew from the residual at a fit (coordinates,)."""
-        self._noise_alone = self._noises.refined(self._noise_alone, self.observations.value - self.predict(u[None])[0])
-        self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
+        simulated = from_first(self._run(self._bench_for(u[None]), 1, self._values(u[None]), silent), self._readings)[0]
+        # what is linear is known of means alone, and changes little within one
+        linear = self.predict(u[None])[0] - self._means(simulated)
+        self._readings = self._noises.refined(
+            self._readings, self._readings.value - simulated - self._means.each(linear)
+        )
+        self.observations = self._averaged()
         self.noise_unlearnt = False
 
     def take_noise(self, other: DriveProblem) -> None:
         """Takes the noise as another problem of these logs has learnt it."""
-        self._noise_alone, self.noise_unlearnt = other._noise_alone, other.noise_unlearnt
-        self.observations = with_discrepancy(self._noise_alone, self._discrepancy)
+        self._readings, self.noise_unlearnt = other._readings, other.noise_unlearnt
+        self.observations = self._averaged()
+
+    def _averaged(self) -> Observations:
+        """Means of the readings, with the noise of the present."""
+        return with_discrepancy(self._means.observations(self._readings), self._discrepancy)
 
     def predict(self, u: np.ndarray) -> np.ndarray:
         """(k, n) predicted observations at (k, coordinates), in the channels' units; not finite where one diverged."""
@@ -236,8 +255,8 @@ class DriveProblem:
         return keys_of_rows((*bench.stamp, self._sampled_at()), names, table)
 
     def _sampled_at(self) -> bytes:
-        if self._stamped[0] is not self.observations:
-            self._stamped = self.observations, stamp_of_observations(self.observations)
+        if self._stamped[0] is not self._readings:
+            self._stamped = self._readings, stamp(self._means.starts, stamp_of_observations(self._readings))
         return self._stamped[1]
 
     @property
@@ -282,12 +301,11 @@ class DriveProblem:
 
         def sampled(side: float) -> np.ndarray:
             series = [
-                dataclasses.replace(s, time=np.asarray(s.time) + side * interval[s.log])
-                for s in self.observations.series
+                dataclasses.replace(s, time=np.asarray(s.time) + side * interval[s.log]) for s in self._readings.series
             ]
-            at = dataclasses.replace(self.observations, series=tuple(series))
+            at = dataclasses.replace(self._readings, series=tuple(series))
             simulated = self._run(bench, 1, self._values(self._reference[None]), silent, at)
-            return from_first(simulated, self.observations)[0]
+            return self._means(from_first(simulated, self._readings)[0])
 
         before, there, after = (sampled(side) for side in (-1.0, 0.0, 1.0))
         rate = 0.5 * (after - before)
@@ -321,8 +339,8 @@ class DriveProblem:
         new = {k: n for n, k in enumerate(keys) if k not in known_rows}
         if new:
             wanted = rows[list(new.values())]
-            simulated = from_first(self._run(bench, len(wanted), self._values(wanted), progress), self.observations)
-            for k, row in zip(new, simulated, strict=True):
+            simulated = from_first(self._run(bench, len(wanted), self._values(wanted), progress), self._readings)
+            for k, row in zip(new, self._means(simulated), strict=True):
                 SIMULATED.keep(k, row)
                 known_rows[k] = row
         return np.stack([known_rows[k] for k in keys])
@@ -330,10 +348,10 @@ class DriveProblem:
     def _run(
         self, bench: Bench, rows: int, values: Rows, progress: Progress, at: Observations | None = None
     ) -> np.ndarray:
-        """(rows, n) what a bench simulates, at the times of other observations if these are given."""
-        out = np.full((rows, len(self.observations)), np.nan)
-        for number, k, sampled in bench.run(rows, values, self.observations if at is None else at, progress):
-            out[k, self._of_log(number)] = sampled
+        """(rows, readings) what a bench simulates, at the times of other readings if these are given."""
+        out = np.full((rows, len(self._readings)), np.nan)
+        for number, k, sampled in bench.run(rows, values, self._readings if at is None else at, progress):
+            out[k, self._readings.of_log.get(number, slice(0, 0))] = sampled
         return out
 
     def _bench_for(self, rows: np.ndarray) -> Bench:
