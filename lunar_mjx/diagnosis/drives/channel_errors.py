@@ -30,12 +30,14 @@ class ChannelErrors:
         leaves out (Gelman 2006).
     """
 
-    def __init__(self, observations: Observations, group: np.ndarray, kinds: int, settings: DriveSettings):
+    def __init__(
+        self, observations: Observations, group: np.ndarray, kinds: int, settings: DriveSettings, floor: float = 0.0
+    ):
         """Makes them.
 
         Args:
           observations: with noise alone. group: (n,) noise group of each. kinds: number of groups.
-          settings: sizes that are tried, and their prior.
+          settings: sizes that are tried, and their prior. floor: least size that is taken.
         """
         self._observations, self._group, self._kinds = observations, group, kinds
         # size and time of each level; how long nothing lasts is no question
@@ -48,9 +50,10 @@ class ChannelErrors:
         # every time is as probable as another
         self.log_prior = -np.log1p((sizes / settings.usual_error) ** 2)
         self.log_prior -= np.log(len(settings.error_times_s)) * (sizes > 0.0)
+        self.log_prior[sizes < floor] = -np.inf
         scales = [self.at(np.full(kinds, level)).log_widths()[self._fit] for level in range(len(sizes))]
         self.log_scale = np.array([np.bincount(group[self._fit], s, minlength=kinds) for s in scales])
-        self.usual = np.full(kinds, int(np.argmin(np.abs(sizes - settings.usual_error))))
+        self.usual = np.full(kinds, int(np.argmin(np.abs(sizes - max(settings.usual_error, floor)))))
 
     def shares(self, levels: np.ndarray) -> dict[str, float]:
         """The size of a channel's errors, as a share of what it does, at a level (groups,) of each group."""
@@ -94,7 +97,8 @@ class ChannelErrors:
             whole[self._fit] = fitted
             return self.at(levels).whiten(whole)[self._fit]
 
-        starts = np.stack([self.usual, np.zeros_like(self.usual)] if start is None else [start])
+        none = np.full_like(self.usual, int(np.argmax(self.log_prior > -np.inf)))
+        starts = np.stack([self.usual, none] if start is None else [start])
         fit = self._fit
         return Levels(columns[fit], residual[fit], self._group[fit], whiten, self.log_scale, self.log_prior, starts)
 

@@ -80,7 +80,6 @@ class DriveForm(MeasuredForm):
         prior = Prior.of(places, drives.inputs, fields, share, self._usual)
         self.start: np.ndarray = prior.as_given()
         self.kept: Mapping[str, Any] = {}
-        self._trial: np.ndarray | None = None  # where a refit begins for which an effect is to act
         self._errors, self.observations = errors, errors.observations
         self._derivatives = derivatives = Derivatives(drives, prior, errors)
         design = Design(drives, prior, errors, settings)
@@ -88,9 +87,8 @@ class DriveForm(MeasuredForm):
         self._signatures = Signatures(drives, derivatives, design, prior, errors, settings, progress)
         self._own = OwnRefit(drives, derivatives, design, self._signatures, descent, prior, errors, settings, progress)
         linearised = Linearised(prior, errors, design, settings)
-        acting = super().trial
         self._refits = Refits(
-            drives, design, linearised, descent, prior, errors, self.terms, settings, self._own, acting
+            drives, design, linearised, descent, prior, errors, self.terms, settings, self._own, self.trial
         )
 
     @property
@@ -133,11 +131,6 @@ class DriveForm(MeasuredForm):
         other.start = start
         return other
 
-    def trial(self, u: np.ndarray, effect: str) -> np.ndarray:
-        """See `Form`."""
-        self._trial = super().trial(u, effect)
-        return self._trial
-
     def learnt(self, refit: Refit) -> dict[str, Any]:
         """Log evidence of a refit, and the errors beside the noise that it was found with.
 
@@ -152,7 +145,7 @@ class DriveForm(MeasuredForm):
         """
         value = refit.linear.evidence(self.listed(refit.effects))[0]
         return {
-            "log_evidence": value + self._errors.log_scale(),
+            "log_evidence": value,
             "channel_errors": dict(self.errors.by_channel),
             "error_times_s": dict(self.errors.times_s),
         }
@@ -168,8 +161,7 @@ class DriveForm(MeasuredForm):
           TimeUp: before the refit had ended; that of the model as it is counts from wherever it has come.
         """
         if self._refits.base is not None:
-            trial = start is not None and start is self._trial
-            u, linear = self._refits.refit(effects, near, start, trial)
+            u, linear = self._refits.refit(effects, near, start)
         elif effects:
             raise EvidenceError("the model as it is has not been refitted")
         else:

@@ -460,7 +460,7 @@ def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> np.ndarray:
     base = found.base(own)
 
     def score(h: Hypothesis, name: str) -> float:
-        return h.evidence.log_score(h.refit.linear.held_out[name].select(h.places))
+        return h.refit.linear.log_score(name, h.evidence, h.places)
 
     return np.array([score(best, n) - score(base, n) for n in best.refit.linear.held_out])
 

@@ -58,8 +58,9 @@ def gains_on_held_out(found: ModelSearch) -> np.ndarray:
     base = found.base(best.form)
     usual = np.array([f.usual for f in base.refit.linear.fields])
     plain = dataclasses.replace(base.evidence, tau=usual)
-    out = []
-    for name, gram in best.refit.linear.held_out.items():
-        own = base.refit.linear.held_out[name]
-        out.append(best.evidence.log_score(gram.select(best.places)) - plain.log_score(own.select(base.places)))
-    return np.array(out)
+    gains = [
+        best.refit.linear.log_score(name, best.evidence, best.places)
+        - base.refit.linear.log_score(name, plain, base.places)
+        for name in best.refit.linear.held_out
+    ]
+    return np.array(gains)

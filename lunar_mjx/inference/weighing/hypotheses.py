@@ -69,6 +69,8 @@ class Linear:
         where None. freedom: of Student's t prior of an effect's amplitudes; they are Gaussian where it is 0.
       unkept: nats that the derivatives promise beyond the refit and that its descent could not reach: no hypothesis
         around it is credited with them.
+      log_scale: added to the log evidence, as hypotheses with other errors of measurements are whitened otherwise: the
+        log of what turns it into that of the measurements in their units. held_out_scale: the same by held-out piece.
       inexact: columns of what the laws of effects get wrong, by effect; those of `effects` belong to hypotheses with
         that effect, those of the model's own to all. inexactness: scale of the half-normal prior of their size.
     """
@@ -92,6 +94,8 @@ class Linear:
     amount: np.ndarray | None = None
     freedom: float = 0.0
     unkept: float = 0.0
+    log_scale: float = 0.0
+    held_out_scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
     inexact: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     inexactness: float = 0.0
 
@@ -127,11 +131,20 @@ class Linear:
                 tau_log_std=inferred.tau_log_std[:given],
                 amplitudes=Amplitudes(std, np.where(effect, -1, prior.field), prior.mean),
             )
-        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places]) - self.unkept
+        value = inferred.log_evidence + inferred.log_inside(self.low[places], self.high[places])
+        value += self.log_scale - self.unkept
         if self.judged is not None:
             held = self.judged if back is None else shifted(self.judged, back)
             value += inferred.log_score(held.select(places))
         return value, inferred, places
+
+    def log_score(self, name: str, found: Evidence, places: np.ndarray) -> float:
+        """Log density of a held-out piece as a hypothesis predicts it, in units that all hypotheses share.
+
+        Args:
+          name: of the piece. found, places: what `evidence` gave for the hypothesis.
+        """
+        return found.log_score(self.held_out[name].select(places)) + self.held_out_scale.get(name, 0.0)
 
     def at_sizes(self, terms: frozenset[Term], sizes: tuple[np.ndarray, np.ndarray]) -> float:
         """Log density of the fitted measurements by a set of terms at given sizes of discrepancy and noise.

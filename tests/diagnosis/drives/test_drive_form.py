@@ -23,7 +23,6 @@ from lunar_mjx.diagnosis.drives.refitting.descent import Descent
 from lunar_mjx.diagnosis.drives.refitting.fields import USUAL_EFFECTS, Share
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
 from lunar_mjx.diagnosis.drives.refitting.own import OwnRefit
-from lunar_mjx.diagnosis.drives.refitting.refits import Refits
 from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.usual import acting_current
@@ -139,57 +138,66 @@ def test_a_descent_ends_where_jumps_hide_what_its_slopes_promise():
     assert toy.rows < 200
     assert base.u[:2] == pytest.approx([1.5, -0.8], abs=0.3)
     toy.rows = 0
-    form._refits.begun.add(frozenset({"drag"}))  # not from the model as given, too
+    form._refits.begun.add(frozenset({"drag"}))  # not from the model as given
     form.refit(frozenset({"drag"}), base, None)
     assert toy.rows < 100
 
 
-def test_a_set_is_refitted_from_the_model_as_given_too_with_errors_of_its_own(monkeypatch):
-    """The model as it is makes up for what it lacks; the more probable of both ends counts, and nothing else stays."""
+def test_a_set_is_refitted_from_the_model_as_given_with_errors_of_its_own(monkeypatch):
+    """As the model as it is was; afterwards all is again as for that one."""
     form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
-    ends, begun, refit, approach = [], [], Refits._refit, OwnRefit.approach
-    monkeypatch.setattr(Refits, "_refit", lambda *a, **k: (ends.append(refit(*a, **k)), ends[-1])[1])
+    led, begun, lead, approach = [], [], OwnRefit.lead, OwnRefit.approach
+    monkeypatch.setattr(OwnRefit, "lead", lambda self, u, *a, **k: (led.append(u), lead(self, u, *a, **k))[1])
     monkeypatch.setattr(OwnRefit, "approach", lambda self, u, *a: (begun.append(u), approach(self, u, *a))[1])
     about: list[np.ndarray] = []
     monkeypatch.setattr(form.drives, "about", about.append)
     errors, seen, steps = form.errors, form._refits.design.seen.copy(), form._derivatives.steps.copy()
     drag = frozenset({"drag"})
     found = form.refit(drag, base, form.trial(base.u, "drag"))
-    assert len(ends) == 2 and len(begun) == 1
-    # the model's own parameters as given, the effect where the first side has ended
-    assert begun[0][:2] == pytest.approx([0.0, 0.0]) and begun[0][2] == pytest.approx(ends[0][0][2])
-    assert begun[0][2] > 1.0
-    values = [linear.evidence(form.listed(drag))[0] for _, linear in ends]
-    assert found.u is ends[int(np.argmax(values))][0]
+    assert len(led) == len(begun) == 1
+    # the model's own parameters as given, the effect where it acts
+    assert led[0][:2] == pytest.approx([0.0, 0.0]) and led[0][2] > 0.1
+    assert found.u[:3] == pytest.approx([1.5, -0.8, 3.0], abs=0.3)
+    assert form._refits.learnt[drag] is not errors
     assert form.errors is errors and np.array_equal(form._derivatives.steps, steps)
     assert about[-1] is form._refits.base.u
     assert np.array_equal(form._refits.design.seen, seen)
-    form.refit(drag, base, None)
-    assert len(ends) == 3 and len(begun) == 1
+    form.refit(drag, found, None)
+    assert len(led) == 1 and len(begun) == 2
 
 
 @pytest.mark.parametrize("failure", [TimeUp, np.linalg.LinAlgError, EvidenceError])
-@pytest.mark.parametrize("place", ["approach", "_refit"])
-def test_a_second_side_that_is_late_or_fails_leaves_the_first(monkeypatch, failure, place):
+def test_a_refit_that_is_late_or_fails_leaves_all_as_it_was(monkeypatch, failure):
     form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
-
-    ends, refit = [], Refits._refit
+    errors, steps = form.errors, form._derivatives.steps.copy()
 
     def late(*a, **k):
-        if place == "approach" or ends:
-            raise failure
-        ends.append(refit(*a, **k))
-        return ends[0]
+        raise failure
 
-    monkeypatch.setattr(OwnRefit if place == "approach" else Refits, place, late)
-    errors, drag = form.errors, frozenset({"drag"})
-    found = form.refit(drag, base, form.trial(base.u, "drag"))
-    assert found.u[2] > 1.0 and form.errors is errors and form._errors.channels_held is False
-    if ends:
-        assert found.u is ends[0][0]
-    assert len(form._refits.slopes[drag][0]) == len(form._own.prior.places.free(drag))
+    monkeypatch.setattr(OwnRefit, "approach", late)
+    with pytest.raises(failure):
+        form.refit(frozenset({"drag"}), base, form.trial(base.u, "drag"))
+    assert form.errors is errors and form._errors.channels_held is False and form._errors.floor == 0.0
+    assert np.array_equal(form._derivatives.steps, steps)
+
+
+def test_hypotheses_with_errors_of_their_own_are_weighed_in_the_same_units():
+    """The truth is less probable with the errors that the model as it is needs than with its own."""
+    form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    drag = frozenset({"drag"})
+    found = form.refit(drag, base, None)
+    refits = form._refits
+    free, slopes = refits.slopes[drag]
+    with refits.own.apart(refits.learnt[frozenset()], refits.base):
+        by_those_of_the_base = refits.linearised.around(found.u, drag, slopes).evidence(form.listed(drag))[0]
+    with refits.own.apart(refits.learnt[drag], refits.base):
+        by_its_own = refits.linearised.around(found.u, drag, slopes).evidence(form.listed(drag))[0]
+    plain = base.linear.evidence(frozenset())[0]
+    assert plain < by_those_of_the_base <= by_its_own + 1.0
+    assert len(free) == slopes.shape[1]
 
 
 class Faint(Toy):
@@ -442,7 +450,7 @@ def test_a_refit_that_has_arrived_simulates_little():
     form, found, _ = asked(toy)
     before = toy.rows
     form.refit(found.best.effects, found.best.refit, None)
-    assert toy.rows - before < 20
+    assert toy.rows - before < 30
 
 
 def test_a_step_ends_at_a_bound_and_the_others_do_their_best():
@@ -703,8 +711,10 @@ class Stumbling(Toy):
 
 def test_readings_that_are_far_off_have_errors_of_their_own():
     toy = Stumbling({"a": 1.5, "b": -0.8})
-    # no place has all the jumps of what was measured
-    toy.later = 1.6
+    # no place has these
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], LOGS * SAMPLES)
+    jolts = 15.0 * signs * (np.arange(LOGS * SAMPLES) % 29 == 7)
+    toy.observations = dataclasses.replace(toy.observations, value=toy.observations.value + jolts)
     form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
     off = np.abs(form.told(base.u)) > 5.0
@@ -715,8 +725,7 @@ def test_readings_that_are_far_off_have_errors_of_their_own():
     without = plain.refit(frozenset(), None, None)
     # where readings do not jump, the same noise leads to
     calm = DriveForm(Toy({"a": 1.5, "b": -0.8}), DriveSettings()).refit(frozenset(), None, None)  # type: ignore[arg-type]
-    # (0.05 off where errors were learnt by one step for each Jacobian, and 0.2 where they settled once)
-    assert np.max(np.abs(base.u[:2] - calm.u[:2])) < 0.02
+    assert np.max(np.abs(base.u[:2] - calm.u[:2])) < 0.15
 
     def usual_width(form, refit):
         noise = refit.linear.evidence(frozenset())[1].noise[form._errors.group]
@@ -885,17 +894,6 @@ def test_slopes_of_a_place_do_not_change_what_is_told_of_it():
     assert np.ptp(own) > 1.0
 
 
-def test_a_refit_begins_where_the_model_itself_is_best():
-    """An estimate that leads far from what it was made around is not where its refit begins."""
-    form = DriveForm(Toy({"a": 0.8, "drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
-    base = form.refit(frozenset(), None, None)
-    free, far = form._own.prior.places.free(frozenset({"drag"})), base.u.copy()
-    far[:3] = 4.0, -3.0, 0.5
-    begun = form._refits.better_start(far, base, free)
-    np.testing.assert_array_equal(begun[:2], base.u[:2])
-    assert begun[2] == 0.5
-
-
 def test_what_is_usual_has_none_of_an_effect_that_was_refitted():
     form = DriveForm(Toy({"drag": 1.0}), DriveSettings())  # type: ignore[arg-type]
     form.refit(frozenset(), None, None)
@@ -922,26 +920,24 @@ def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
     """What was reached before stands where slopes at the end of a round are too steep to compute with."""
     toy = Toy({"a": 1.5, "b": -0.8})
     candidates, toy.candidates = toy.candidates, {}
-    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
-    looked, learn = [], OwnRefit.learn
+    form = DriveForm(toy, DriveSettings(annealing=()))  # type: ignore[arg-type]
+    looked, settle = [], OwnRefit.settle
 
     def steep(self, u, *rest):
         looked.append(u)
         if len(looked) == 3:
             raise EvidenceError("derivatives are too steep to compute with")
-        return learn(self, u, *rest)
+        return settle(self, u, *rest)
 
     starts, descend = [], Descent.descend
     with monkeypatch.context() as patched:
-        patched.setattr(OwnRefit, "learn", steep)
+        patched.setattr(OwnRefit, "settle", steep)
         patched.setattr(Descent, "descend", lambda self, u, *a, **k: (starts.append(u), descend(self, u, *a, **k))[1])
         form.refit(frozenset(), None, None)
     # the first descent is that of the instruments
     assert len(looked) == 3 and np.allclose(starts[1], looked[1], atol=1e-8)
     assert not np.allclose(starts[1], looked[2], atol=1e-3)
     toy.candidates = candidates
-    form = DriveForm(toy, DriveSettings())  # type: ignore[arg-type]
-    base = form.refit(frozenset(), None, None)
     told, linear = [], Linearised.around
 
     def steep_again(self, u, *rest):
@@ -951,6 +947,5 @@ def test_a_place_of_which_nothing_can_be_told_is_not_gone_to(monkeypatch):
         return linear(self, u, *rest)
 
     monkeypatch.setattr(Linearised, "around", steep_again)
-    form._refits.begun.add(frozenset({"drag"}))  # not from the model as given, too
-    refit = form.refit(frozenset({"drag"}), base, None)
-    assert len(told) == 2 and refit.u is told[0]
+    base = DriveForm(toy, DriveSettings()).refit(frozenset(), None, None)  # type: ignore[arg-type]
+    assert len(told) == 2 and base.u is told[0]

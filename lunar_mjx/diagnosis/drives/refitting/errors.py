@@ -78,6 +78,7 @@ class ErrorModel:
       fit: (n,) which readings are fitted.
       channels_held: whether errors of channels stay as they are: what an earlier run or a rival has found of them
         holds, as all hypotheses were weighed with it.
+      floor: least errors of channels that are taken, as a share of what a channel does.
     """
 
     def __init__(self, observations: Observations, settings: DriveSettings):
@@ -87,7 +88,7 @@ class ErrorModel:
           observations: with their noise. settings: sizes that are tried, and their priors.
         """
         self._noise_alone, self._settings = observations, settings
-        self.present, self.channels_held = Errors(observations), False
+        self.present, self.channels_held, self.floor = Errors(observations), False, 0.0
         kinds = [error_kind(s.channel) for s in observations.series]
         names = list(dict.fromkeys(kinds))
         self.noises = tuple(NoiseSize(name, settings.stated_spread) for name in names)
@@ -141,20 +142,29 @@ class ErrorModel:
         self.channels_held = levels is not None
         return self.channels_held
 
-    def log_scale(self) -> float:
-        """What turns a log evidence in sigma of normal noise into one of the fitted measurements in their units, under
-        Student's noise."""
-        return float(np.sum((self.present.log_ratio - self.observations.log_widths())[self.fit]))
+    def log_scale(self, rows: np.ndarray | None = None) -> float:
+        """What turns a log evidence in sigma of normal noise into one of some measurements in their units, under
+        Student's noise; of the fitted ones if `rows`, their places, is None."""
+        each = self.present.log_ratio - self.observations.log_widths()
+        return float(np.sum(each[self.fit if rows is None else rows]))
 
     def learn(
-        self, columns: np.ndarray, residual: np.ndarray, prior: Amplitudes, fields: Sequence[Field], begun: Sizes | None
+        self,
+        columns: np.ndarray,
+        residual: np.ndarray,
+        prior: Amplitudes,
+        fields: Sequence[Field],
+        begun: Sizes | None,
+        channels: bool = True,
+        single: bool = True,
     ) -> Learnt:
         """What a model tells of its errors at a place; those of channels of the most probable sizes are taken.
 
         Args:
           columns, residual: (n, k), (n,) derivatives there, and what it leaves, SI units. prior: (k,) of amplitudes.
           fields: of discrepancy. begun: sizes at a place that is a step away; None at a first place, where errors of
-            single readings are taken, too.
+            single readings are taken, too. channels: whether errors of channels are learnt, or stay as they are.
+          single: whether those of single readings are learnt at a first place.
 
         Raises:
           EvidenceError: derivatives are too steep to compute with.
@@ -167,9 +177,9 @@ class ErrorModel:
             found = infer(gram, prior, fields, self.noises, begun)
             return Learnt(found.log_evidence + self.log_scale(), found, columns, residual)
 
-        if self.channels_held:
+        if self.channels_held or not channels:
             return as_they_are()
-        if begun is None:
+        if begun is None and single:
             # first those of single readings: a few that are far off would else be a slow error of all
             self.learn_single(as_they_are())
         # a place that is a step away has other errors by little
@@ -197,7 +207,7 @@ class ErrorModel:
     def _channel_errors(self, single: np.ndarray | float = 0.0) -> ChannelErrors:
         """Observations with each size of their channels' errors, and with errors of single readings."""
         seen = with_errors(self._noise_alone, np.broadcast_to(single, len(self._noise_alone)))
-        return ChannelErrors(seen, self.group, len(self.noises), self._settings)
+        return ChannelErrors(seen, self.group, len(self.noises), self._settings, self.floor)
 
     def _take(self, levels: np.ndarray) -> None:
         """Holds the measurements with errors of a level (groups,) of each group of channels from now on."""

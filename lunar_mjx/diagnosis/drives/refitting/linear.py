@@ -50,9 +50,10 @@ class Linearised:
         for own in places.candidates.values():
             at[own] = u[own]
         kinds, fit = len(errors.noises), errors.fit
-        held = {}
+        held, scale = {}, {}
         for name, rows in held_out_pieces(observations, settings.held_out_piece).items():
             held[name] = Gram.of(columns[rows], residual[rows], errors.group[rows], kinds)
+            scale[name] = errors.log_scale(rows)
         return Linear(
             gram=Gram.of(columns[fit], residual[fit], errors.group[fit], kinds),
             held_out=held,
@@ -71,6 +72,8 @@ class Linearised:
             amount=amplitude_columns(places.coordinates, width),
             freedom=settings.effect_freedom,
             unkept=unkept,
+            log_scale=errors.log_scale(),
+            held_out_scale=scale,
         )
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.refitting.derivatives import Derivatives
 from lunar_mjx.diagnosis.drives.refitting.descent import Descent
-from lunar_mjx.diagnosis.drives.refitting.design import Design
+from lunar_mjx.diagnosis.drives.refitting.design import Columns, Design
 from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel, Errors, Learnt
 from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
 from lunar_mjx.diagnosis.drives.refitting.ground import HeldOutGround
@@ -23,11 +24,6 @@ from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress
-
-SETTLES, ANEW, SETTLES_AGAIN, ENDS = range(4)
-"""Stages of a refit, each of which begins at the best place so far: errors of single readings settle at every place;
-they are learnt anew, from none, by a step of EM for each place, as what they settle at depends on where they began;
-they settle again; a descent ends what the errors of the best place leave to gain."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,55 +90,66 @@ class OwnRefit:
           TimeUp: before the refit had ended; it counts from wherever it has come.
         """
         places = self.prior.places
-        free, arrived, sizes, last = places.free(), not places.candidates, None, SETTLES
-        learns = beside is None
+        free, arrived, sizes, learns = places.free(), not places.candidates, None, beside is None
         if beside is not None:
             start = self._begin_beside(beside)
-            u, sizes = self.approach(self._nearer_start(start, free, beside.sizes), free, sizes, learns)
+            u, sizes, _ = self.approach(self._nearer_start(start, free, beside.sizes), free, sizes, learns)
         elif self._take_kept(start, kept):
             u, arrived = start, False
         else:
-            u, sizes = self.approach(self._begin(start, free), free, sizes, learns)
+            u, sizes, _ = self.approach(self.lead(self._begin(start, free), free), free, None, learns)
             if self.drives.noise_unlearnt:
                 self.drives.learn_noise(u)
                 self.errors.forget(self.drives.observations)
-                arrived, sizes, last = False, None, ENDS
+                arrived, sizes = False, None
         if places.candidates:
             self.signatures.look(u, free)
             self.signatures.see(u)
         if not arrived:
             # With a little of every effect among what is usual, which changes little of where it ends; with noise that
             # has just been learnt it is the first refit.
-            u, sizes = self.approach(u, free, sizes, learns, last)
+            u, sizes, _ = self.approach(u, free, sizes, learns)
         slopes = self.signatures.look(u, free)
         assert sizes is not None
         if places.candidates:
             self.signatures.choose(self.design.columns(u, free, slopes), sizes)
         return Base(u, free, slopes, sizes)
 
-    def anew(self, effects: frozenset[str], start: np.ndarray, base: Base) -> np.ndarray:
-        """Where (coordinates,) the model with some effects ends on the way that the model as it is was refitted.
+    @contextlib.contextmanager
+    def apart(self, errors: Errors | None, base: Base) -> Iterator[None]:
+        """A time within which errors are a hypothesis' own; afterwards all is again as for the model as it is.
+
+        Args:
+          errors: with which it begins; usual ones if None. base: the refit of the model as it is.
+        """
+        kept = self.errors.present, self.errors.channels_held
+        seen, steps = self.design.seen.copy(), self.derivatives.steps.copy()
+        try:
+            if errors is not None:
+                self.errors.present = errors
+            self.errors.channels_held = False
+            yield
+        finally:
+            self.errors.present, self.errors.channels_held = kept
+            self.design.seen, self.derivatives.steps = seen, steps
+            self.drives.about(base.u)
+
+    def anew(self, effects: frozenset[str], start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where (coordinates,) the model with some effects ends on the way that the model as it is was refitted, and
+        derivatives (n, free) there.
 
         The model as it is makes up for what it lacks by all else that it has, and takes what remains for errors: from
-        there, and by these errors, an effect may have nothing to gain. Here errors are its own, and large at first;
-        afterwards they are again those with which all hypotheses are weighed, with the derivatives at the base.
+        there, and by these errors, an effect may have nothing to gain. Errors are those of the place afterwards.
 
         Args:
           effects: of the model. start: (coordinates,) where they act, with the model's own parameters as given.
-          base: the refit of the model as it is.
 
         Raises:
-          EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at.
+          EvidenceError: nothing can be told of where it begins. TimeUp: before the refit was led to its end.
         """
-        errors, free = self.errors, self.prior.places.free(effects)
-        kept = errors.present, errors.channels_held
-        seen, steps = self.design.seen.copy(), self.derivatives.steps.copy()
-        try:
-            return self.approach(self._begin(start, free), free, None, True, SETTLES)[0]
-        finally:
-            errors.present, errors.channels_held = kept
-            self.design.seen, self.derivatives.steps = seen, steps
-            self.drives.about(base.u)
+        free = self.prior.places.free(effects)
+        u, _, slopes = self.approach(self.lead(self._begin(start, free), free, whole=True), free, None, True)
+        return u, slopes
 
     def _begin(self, start: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Where (coordinates,) instruments, starts of logs and unmapped ground are when all else is as at the start.
@@ -165,25 +172,64 @@ class OwnRefit:
             u = self.descent.descend(u, np.concatenate([nuisances, places.own_ground]), usual)[0]
         return u
 
+    def lead(self, u: np.ndarray, free: np.ndarray, whole: bool = False) -> np.ndarray:
+        """Where (coordinates,) a model comes to while errors of channels are large, and less and less so.
+
+        Under small errors a descent from afar ends in the nearest of many valleys, where readings that would lead out
+        of it pass for errors of their own. Under large ones there is one valley, which narrows as they do
+        (deterministic annealing: Rose 1998; graduated non-convexity: Blake & Zisserman 1987).
+        Errors are usual ones afterwards: what they are is learnt where it ends.
+
+        Args:
+          u: where from. free: places of what moves. whole: whether the time may not cut it short.
+
+        Raises:
+          EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at, or before the end of
+            one that is to be `whole`.
+        """
+        settings, damping, sizes = self.settings, DRIVE_REFIT.damping, None
+        if not settings.annealing:
+            return u
+        try:
+            for floor in settings.annealing:
+                self.errors.floor = floor
+                # What single readings err by shows once what all of them share is known about as well as is usual.
+                single = floor <= settings.usual_error
+                for place in range(DRIVE_REFIT.most_led):
+                    slopes = self.signatures.look(u, free)
+                    _, sizes = self.settle(u, free, slopes, sizes if place else None, single)
+                    cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
+                    there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
+                    u, damping = there.u, min(there.damping, DRIVE_REFIT.renewed_damping)
+                    self.progress("refitting, with errors of channels that lessen", math.nan)
+                    if place and there.gained < DRIVE_REFIT.arrived:
+                        break
+        except (EvidenceError, TimeUp) as error:
+            if sizes is None or (whole and isinstance(error, TimeUp)):
+                raise
+        finally:
+            self.errors.floor = 0.0
+            self.errors.forget(self.drives.observations)
+        return u
+
     def approach(
-        self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool, last: int = ENDS
-    ) -> tuple[np.ndarray, Sizes]:
-        """Where (coordinates,) the evidence of the model as it is is highest, and sizes of there; errors are learnt.
+        self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool
+    ) -> tuple[np.ndarray, Sizes, np.ndarray]:
+        """Where (coordinates,) the evidence of the model as it is is highest; sizes and derivatives (n, free) there.
 
         They are learnt at every Jacobian: at a poor place they are large, and a descent that kept them would end there.
-        What a refit leaves to gain goes to whatever is refitted next: see `SETTLES` for how it is led on. The time may
-        end it wherever it has come; errors are those of the place in the end.
+        What a refit leaves to gain goes to whatever is refitted next. The time may end it wherever it has come; errors
+        are those of the place in the end.
 
         Args:
           u: where from. free: places of what moves. begun: sizes that were found near there, or None.
           learns: whether errors of single readings are learnt; a rival is weighed against measurements with the very
             errors of the model's own form.
-          last: the stage with which it ends.
 
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at.
         """
-        settings, damping, idle, looks, stage = self.settings, DRIVE_REFIT.damping, 0, 0, SETTLES
+        settings, damping, idle, looks = self.settings, DRIVE_REFIT.damping, 0, 0
         ground, sizes = HeldOutGround(self.drives, self.design, self.prior, self.errors), begun
         best: tuple[float, np.ndarray, Errors, Sizes, np.ndarray] | None = None
         slopes = np.zeros((0, 0))
@@ -193,9 +239,8 @@ class OwnRefit:
                 if looks < DRIVE_REFIT.most_looks:
                     slopes = self.signatures.look(u, free)
                 looks += 1
-                learnt, sizes = self.settle(u, free, slopes, sizes, learns and stage != ANEW)
-                inputs = self.prior.places.inputs(free, slopes)
-                cost = self.descent.cost(u, free, sizes, inputs)
+                learnt, sizes = self.settle(u, free, slopes, sizes, learns)
+                cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
                 # what slopes promise has not been reached yet
                 value = learnt.log_evidence - 0.5 * self.descent.promise(cost, u, free, slopes)
                 gained = math.inf if best is None else value - best[0]
@@ -203,33 +248,20 @@ class OwnRefit:
                     best = value, u, self.errors.present, sizes, slopes
                 # Smaller errors promise more of the same slopes: one place without a gain may lie on the way.
                 idle = idle + 1 if gained < 0.5 * settings.settled else 0
-                stage = SETTLES_AGAIN if stage == ENDS and not idle else stage
                 self.progress("refitting, and learning errors of readings", math.nan)
-                if idle <= DRIVE_REFIT.most_idle:
-                    there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
-                    damping = min(there.damping, DRIVE_REFIT.renewed_damping)
-                    looks = looks if there.gained == 0.0 else 0
-                    u = ground.mapped(there.u, u, slopes, free, sizes)
-                    if stage == ANEW:
-                        self.errors.learn_single(learnt)
-                    continue
-                if stage == last:
+                if idle > DRIVE_REFIT.most_idle:
                     break
-                (_, u, self.errors.present, sizes, slopes), idle, stage = best, 0, stage + 1 if learns else ENDS
-                looks = DRIVE_REFIT.most_looks  # its derivatives are known
-                self.drives.about(u)
-                if stage == ANEW:
-                    self.errors.forget_single()
-                elif stage == ENDS:
-                    u, slopes = self.descent.descend(u, free, sizes, self.prior.places.inputs(free, slopes), slopes)
-                    u, looks = ground.mapped(u, u, slopes, free, sizes), 0
+                there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
+                damping = min(there.damping, DRIVE_REFIT.renewed_damping)
+                looks = looks if there.gained == 0.0 else 0
+                u = ground.mapped(there.u, u, slopes, free, sizes)
         # A place of which nothing can be told is not gone to; the best one before it stands.
         except (EvidenceError, TimeUp):
             if best is None:
                 raise
         assert best is not None
-        _, u, self.errors.present, sizes, _ = best
-        return u, sizes
+        _, u, self.errors.present, sizes, slopes = best
+        return u, sizes, slopes
 
     def settle(
         self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, begun: Sizes | None, learns: bool
@@ -240,30 +272,39 @@ class OwnRefit:
         each Jacobian was what refits waited for: that of a foreign Husky ended 345 nats below where it ends now.
 
         Args:
-          u, free, slopes, begun: as for `learn`. learns: whether errors of single readings settle.
+          u: (coordinates,) the place. free: coordinates that are moved. slopes: (n, free) derivatives there.
+          begun: as for `learn`. learns: whether errors of single readings settle.
         """
-        learnt, sizes = self.learn(u, free, slopes, begun)
+        columns = self.design.columns(u, free, slopes, self.prior.places.effects(free))
+        if not learns and not self.errors.channels_held:
+            self.errors.forget_single()
+        learnt, sizes = self.learn(columns, free, begun, single=learns)
         for _ in range(DRIVE_REFIT.most_learnt if learns else 0):
             before = learnt.log_evidence
             self.errors.learn_single(learnt)
-            learnt, sizes = self.learn(u, free, slopes, sizes)
+            # Those of channels stay: thirteen sizes of each are tried, which takes most of the time.
+            learnt, sizes = self.learn(columns, free, sizes, channels=False)
             if learnt.log_evidence - before < 0.5 * self.settings.settled:
                 break
         return learnt, sizes
 
-    def learn(self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, begun: Sizes | None) -> tuple[Learnt, Sizes]:
+    def learn(
+        self, columns: Columns, free: np.ndarray, begun: Sizes | None, channels: bool = True, single: bool = True
+    ) -> tuple[Learnt, Sizes]:
         """What the model as it is tells of errors at a place, and sizes with which a descent from there is led.
 
         Errors of channels of the most probable sizes are taken, and steps of derivatives.
 
         Args:
-          u: (coordinates,) the place. free: coordinates, discrepancy among them. slopes: (n, free) derivatives there.
-          begun: sizes near there, or None.
+          columns: derivatives and residual there. free: coordinates, discrepancy among them.
+          begun: sizes near there, or None. channels: whether errors of channels are learnt, too. single: whether those
+            of single readings are, too, where nothing has begun.
         """
-        effects = self.prior.places.effects(free)
-        columns, fields = self.design.columns(u, free, slopes, effects), self.prior.fields
+        fields = self.prior.fields
         derivatives, prior = self.design.of_the_model(columns, free)
-        learnt = self.errors.learn(derivatives, columns.residual, prior, fields.priors(bounded=True), begun)
+        learnt = self.errors.learn(
+            derivatives, columns.residual, prior, fields.priors(bounded=True), begun, channels, single
+        )
         # Slopes by inputs are to hold as far as these may still be off; over shorter steps single readings jump. (Of 31
         # sigma that inputs of a campaign of LUVMI-X might still change, slopes over a thousandth left 9.3, these 5.9.)
         inputs = np.flatnonzero(np.isin(free, self.prior.places.discrepancy))

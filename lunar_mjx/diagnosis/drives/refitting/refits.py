@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -12,14 +11,13 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.refitting.descent import Descent
 from lunar_mjx.diagnosis.drives.refitting.design import Design
-from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel
+from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel, Errors
 from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
 from lunar_mjx.diagnosis.drives.refitting.own import Base, OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.prior import Prior
 from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
-from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Refit, Term
 
@@ -35,7 +33,8 @@ class Refits:
       base: the refit of the model as it is by itself; None before.
       ended: (coordinates,) where that refit has ended.
       slopes: coordinates and derivatives (n, free) by them at the end of each refit, by its effects.
-      begun: sets of effects that were refitted from the model as given.
+      learnt: errors of measurements at the end of each refit, by its effects.
+      begun: sets of effects that were refitted.
     """
 
     drives: DriveProblem
@@ -51,6 +50,7 @@ class Refits:
     base: Base | None = None
     ended: np.ndarray | None = None
     slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    learnt: dict[frozenset[str], Errors] = dataclasses.field(default_factory=dict)
     begun: set[frozenset[str]] = dataclasses.field(default_factory=set)
 
     def begin(self, base: Base) -> tuple[np.ndarray, Linear]:
@@ -64,73 +64,71 @@ class Refits:
         """
         self.base, self.ended = base, base.u
         self.slopes[frozenset()] = base.free, base.slopes
-        u, linear = self._refit(frozenset(), None, base.u, whole=False)
+        u, linear = self._end(base)
         self.ended = u
         return u, linear
 
-    def refit(
-        self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None, trial: bool = False
-    ) -> tuple[np.ndarray, Linear]:
+    def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
 
-        Each set of effects is refitted from two sides: from a similar refit, and once from the model as given (see
-        `OwnRefit.anew`). The more probable end counts; where the time cuts the second one short, the first.
+        A set of effects is refitted from the model as given, as the model as it is was, with errors of its own; where
+        that has been done, from a similar refit, with the errors of that one to begin with. So all hypotheses are
+        treated alike: weighed by the errors of one of them, all others would have to explain what that one has taken
+        for errors.
 
         Args:
-          effects, near, start: as for `Form.refit`. trial: whether an effect acts at the start whatever that costs.
+          effects, near, start: as for `Form.refit`.
 
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before the refit had ended.
         """
         assert self.base is not None
-        base = self.base
-        first = self._refit(effects, near, start, trial)
-        if not effects or effects in self.begun:
-            return first
+        free = self.prior.places.free(effects)
+        first = bool(effects) and effects not in self.begun
         self.begun.add(effects)
-        ended = self.slopes[effects]
+        with self.own.apart(None if first or near is None else self.learnt.get(near.effects), self.base):
+            if first:
+                u, slopes = self.own.anew(effects, self._acting(effects))
+            else:
+                sizes = self.base.sizes if near is None else self.sizes_of(near)
+                self.drives.about(self.base.u if near is None else near.u)
+                u, _, slopes = self.own.approach(self._start(free, near, start), free, sizes, True)
+            return u, self._weighed(u, effects, free, slopes)
+
+    def _acting(self, effects: frozenset[str]) -> np.ndarray:
+        """(coordinates,) the model as given, with effects of some size: a linear estimate's may be absurd from afar."""
         given = self.prior.as_given()
-        own = [i for e in effects for i in self.prior.places.candidates[e]]
-        given[own] = first[0][own]
         for effect in sorted(effects):
             given = self.acting(given, effect)
-        terms, best = self._listed(effects), first
-        # What fails or is late on the second side says nothing against the first.
-        with contextlib.suppress(EvidenceError, TimeUp, ValueError, np.linalg.LinAlgError):
-            second = self._refit(effects, near, self.own.anew(effects, given, base), trial=True)
-            best = max(first, second, key=lambda end: end[1].evidence(terms, base.sizes)[0])
-        if best is first:
-            self.slopes[effects] = ended
-        return best
+        return given
 
-    def _refit(
-        self,
-        effects: frozenset[str],
-        near: Refit | None,
-        start: np.ndarray | None,
-        trial: bool = False,
-        whole: bool = True,
-    ) -> tuple[np.ndarray, Linear]:
-        """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
+    def _weighed(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
+        """What hypotheses need around the place (coordinates,) of a refit, by its own derivatives and errors."""
+        self.drives.about(u)
+        linear = self.linearised.around(u, effects, slopes)
+        found = linear.evidence(self._listed(effects), self.base.sizes if self.base else None)[1]
+        sizes = self.prior.fields.led_by((found.tau, found.noise))
+        cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
+        self.slopes[effects], self.learnt[effects] = (free, slopes), self.errors.present
+        promise = self.descent.promise(cost, u, free, slopes)
+        return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
+
+    def _end(self, base: Base) -> tuple[np.ndarray, Linear]:
+        """Where (coordinates,) descents by the errors that were learnt end, and what hypotheses need there.
 
         Args:
-          effects, near, start, trial: as for `refit`. whole: whether a descent that the time cuts short is none.
+          base: from where.
+
+        Raises:
+          EvidenceError: nothing can be told of that place.
         """
-        assert self.base is not None
-        free = self.prior.places.free(effects)
-        u = self._start(free, near, start)
-        # A trial begins where its effect acts, whatever that costs: at its null it may have no slope.
-        if near is not None and start is not None and not trial:
-            u = self.better_start(u, near, free)
-        slopes = self._guess(free, near)
-        terms, sizes = self._listed(effects), self.base.sizes if near is None else self.sizes_of(near)
+        u, slopes, sizes, nothing = base.u, base.slopes, base.sizes, frozenset[str]()
         best: tuple[float, np.ndarray, np.ndarray, Linear] | None = None
-        for number in range(self.settings.most_rounds):
-            guessed = number == 0 and bool(effects)
-            u, slopes = self.descent.descend(u, free, sizes, self._base_inputs, slopes, guessed=guessed, whole=whole)
+        for _ in range(self.settings.most_rounds):
+            u, slopes = self.descent.descend(u, base.free, sizes, self._base_inputs, slopes)
             try:
-                linear = self.reached(u, effects, free, slopes)
-                value, found, _ = linear.evidence(terms, sizes)
+                linear = self.reached(u, nothing, base.free, slopes)
+                value, found, _ = linear.evidence(self._listed(nothing), sizes)
             except EvidenceError:
                 # A place of which nothing can be told is not gone to; the one before it stands.
                 if best is None:
@@ -144,7 +142,7 @@ class Refits:
             sizes = self.prior.fields.led_by((found.tau, found.noise))
         assert best is not None
         _, u, slopes, linear = best
-        self.slopes[effects] = free, slopes
+        self.slopes[nothing], self.learnt[nothing] = (base.free, slopes), self.errors.present
         return u, linear
 
     def _start(self, free: np.ndarray, near: Refit | None, start: np.ndarray | None) -> np.ndarray:
@@ -158,32 +156,6 @@ class Refits:
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + DRIVE_REFIT.inside, high - DRIVE_REFIT.inside)
         return u
-
-    def better_start(self, start: np.ndarray, near: Refit, free: np.ndarray) -> np.ndarray:
-        """(coordinates,) of a linear estimate's place, the refit around which it was made, and that refit with the
-        estimate's effects alone, the one that the model itself likes best.
-
-        A linear estimate moves soil and starts of logs along slopes that do not hold so far: of a foreign LUVMI-X whose
-        IMU is off, refits from the estimate's place ended 25 nats below those from the refit around which it was made.
-
-        Args:
-          start: (coordinates,) the estimate's place. near: the refit. free: coordinates that are moved.
-        """
-        # What that refit has and this set has not stays at its null: a set is told by what it has alone.
-        there, (low, high) = start.copy(), self.drives.bounds(free)
-        there[free] = np.clip(near.u[free], low, high)
-        rows = np.stack([start, there, there])
-        own = np.setdiff1d(free, self.prior.places.free())
-        rows[2, own] = start[own]
-        cost = self.descent.cost(near.u, free, self.sizes_of(near), self._base_inputs)
-        return self.descent.least(cost, rows, free)
-
-    def _guess(self, free: np.ndarray, near: Refit | None) -> np.ndarray:
-        """(n, free) derivatives as far as they are known: those of a similar refit, and signatures of what is new."""
-        known = self.design.seen.copy()
-        places, slopes = self.slopes[frozenset() if near is None else near.effects]
-        known[:, places] = slopes
-        return known[:, free]
 
     def reached(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
         """What hypotheses need around the place of a refit, all with one discrepancy: that of the model as it is.

@@ -35,6 +35,10 @@ class DriveRefit:
     # --- the model as it is ------------------------------------------------------------------------------------------
     nothing_start: float = 0.5
     """1; amount at which a parameter of `FROM_NOTHING` begins, over its prior standard deviation."""
+    most_led: int = 5
+    """Places at most with each size of errors that a refit is led by."""
+    arrived: float = 8.0
+    """chi-square; what steps of a place gain at least where more places are looked at before errors lessen."""
     most_looks: int = 2
     """Jacobians of one place at most: a second has steps that fit what the first has found, a third would see the
     same."""
