@@ -8,6 +8,7 @@ import pytest
 import lunar_mjx.diagnosis.drives.form as module
 from lunar_mjx.diagnosis.drives.form import DriveForm
 from lunar_mjx.diagnosis.drives.refitting import prior
+from lunar_mjx.diagnosis.drives.refitting.own import OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step, promise_left, promised
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from tests.diagnosis.drives.test_drive_form import USUAL, Toy
@@ -41,17 +42,15 @@ def test_a_step_within_bounds_that_leads_uphill_is_no_promise():
     assert promise_left(normal, downhill, np.zeros(3), -far, far) == pytest.approx(best)
 
 
-def test_a_trial_begins_where_its_effect_acts(monkeypatch):
-    """Even where the model is better without it: at its null it may have no slope."""
+def test_a_refit_begins_where_its_effects_act(monkeypatch):
+    """At its null an effect may have no slope, and the amount of an estimate may be absurd."""
     form = DriveForm(Toy({"a": 0.8}), DriveSettings())  # type: ignore[arg-type]
-    base, begun, descent = form.refit(frozenset(), None, None), [], form._refits.descent
-    descend = descent.descend
-    monkeypatch.setattr(descent, "descend", lambda u, *rest, **more: (begun.append(u[2]), descend(u, *rest, **more))[1])
-    start = form.trial(base.u, "drag")
-    form.refit(frozenset({"drag"}), base, start)
-    form.refit(frozenset({"drag"}), base, start.copy())
-    assert begun[0] == 0.5 * form.effect_size(form.coordinates[2])
-    assert 0.0 in begun
+    base, begun, lead = form.refit(frozenset(), None, None), [], OwnRefit.lead
+    monkeypatch.setattr(OwnRefit, "lead", lambda self, u, *a, **k: (begun.append(u[2:4]), lead(self, u, *a, **k))[1])
+    far = base.u.copy()
+    far[2] = 40.0
+    form.refit(frozenset({"drag", "lag"}), base, far)
+    assert begun[0].tolist() == [0.5 * form.effect_size(form.coordinates[i]) for i in (2, 3)]
 
 
 def test_what_is_nothing_in_a_model_begins_where_it_acts(monkeypatch):
