@@ -10,6 +10,8 @@ EXIT_STATUS = 2
 """Exit status of a command that a mistake of the user's ends."""
 LONGEST_PATH = 4000
 """Characters; what is longer is no path anywhere."""
+LONGEST_NAME = 255
+"""Bytes of one part of a path, which usual file systems keep at most."""
 
 
 class UserError(ValueError):
@@ -81,6 +83,17 @@ def require_within(
             f"give {least}" + (f", {high:g} at most" if high < math.inf else ""),
         )
     return number
+
+
+def require_name(source: str | Path, field: str, value: Any, remedy: str = "give a name or a path in quotes") -> str:
+    """Returns `value` if a name or path can be called so, or raises `UserError`."""
+    if not isinstance(value, str) or not value:
+        raise bad_input(source, field, value, "is not a name", remedy)
+    longest = max(len(part.encode("utf-8", "surrogatepass")) for part in value.split("/"))
+    # A line break or a byte of zero is damage, and would break the sentence or the system's call.
+    if any(ord(c) < 32 for c in value) or longest > LONGEST_NAME or len(value) > LONGEST_PATH:
+        raise bad_input(source, field, value, "is no name of a file or folder", remedy)
+    return value
 
 
 def require_file(path: str | Path, what: str) -> Path:

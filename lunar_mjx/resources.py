@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, one_line
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -34,9 +34,13 @@ def find(kind: str, name: str | Path, marker: str) -> Path:
     """
     named = isinstance(name, str | Path)
     for folder in (Path(name), shipped(kind) / str(name)) if named else ():
-        if (folder / marker).is_file():
-            return folder
+        try:
+            if (folder / marker).is_file():
+                return folder
+        except OSError:  # longer than a file system keeps names
+            continue
     known = ", ".join(sorted(p.parent.name for p in shipped(kind).glob(f"*/{marker}")))
     raise UserError(
-        f"{name}: no folder of that path or name holds {marker}; shipped with the package: {known or 'none'}."
+        f"{one_line(name)[:200]}: no folder of that path or name holds {marker}; "
+        f"shipped with the package: {known or 'none'}."
     )

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 
+from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.pytree import pytree
 
 SYNODIC_DAY = 29.530588 * 86400.0
 """From noon to noon on the Moon, s."""
+ENVIRONMENT: Mapping[str, tuple[float, float]] = {
+    "ambient_temperature_degC": (-273.15, 1000.0),
+    "sun_azimuth_deg": (-360.0, 360.0),
+    "sun_elevation_deg": (-90.0, 90.0),
+}
+"""What a log or a manoeuvre may state of its surroundings: from absolute zero to what no rover outlives, and turns."""
+
+
+def require_environment(source: str | Path, field: str, key: str, value: float) -> float:
+    """A value of `ENVIRONMENT`, in the unit of its key.
+
+    Raises:
+      UserError: it is none that a rover meets; `source` and `field` say where it stands.
+    """
+    low, high = ENVIRONMENT[key]
+    if key.endswith("_degC") and not low < value < high:
+        raise bad_input(source, field, value, "is no temperature in degC", f"give degrees Celsius above {low:g}")
+    return require_within(source, field, value, low, high)
 
 
 @pytree

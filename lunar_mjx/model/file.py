@@ -12,7 +12,7 @@ import tomli_w
 from lunar_mjx.effects import catalogue
 from lunar_mjx.effects.base import Effect, Parameter
 from lunar_mjx.effects.presets import PRESETS
-from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx.errors import UserError, bad_input, require_file, require_finite, require_name, require_within
 from lunar_mjx.files import write_text
 from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.model.model import (
@@ -76,8 +76,7 @@ def load_model(path: str | Path) -> Model:
     if data.get("format") != FORMAT:
         raise bad_input(path, "format", data.get("format"), "is not known", f'write format = "{FORMAT}"')
     for key in ("rover", "terrain"):
-        if not isinstance(data.get(key), str) or not data[key]:
-            raise bad_input(path, key, data.get(key), "is not a name", f"name a {key} or the path of one")
+        require_name(path, key, data.get(key), f"name a {key} or the path of one")
     preset = _text(path, "preset", data.get("preset", "consistent"))
     if preset not in PRESETS:
         raise bad_input(path, "preset", preset, "does not exist", f"use one of {', '.join(PRESETS)}")
@@ -225,6 +224,8 @@ def _control(path: Path, table: Mapping[str, Any], model: Model) -> tuple[dict[s
 def _grounds(path: Path, names: Any) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(n, str) and n for n in names):
         raise bad_input(path, "grounds", names, "is no list of names", 'write it like ["flooring", "asphalt"]')
+    if len(set(names)) < len(names):
+        raise bad_input(path, "grounds", names, "names one twice", "name every ground once")
     return tuple(names)
 
 
@@ -242,6 +243,11 @@ def _priors(path: Path, table: Mapping[str, Any], model: Model) -> dict[str, tup
         value, std = (_number(path, f"{field}.{k}", entry.get(k)) for k in ("value", "std"))
         if std < 0.0:
             raise bad_input(path, f"{field}.std", std, "is negative", "give a standard deviation, or 0 to fix it")
+        if known is not None and parameter in known.parameters:
+            low, high = known.parameters[parameter].bounds
+            require_within(path, f"{field}.value", value, low, high)
+            # What is known no better than the whole range is not known, and is left out.
+            require_within(path, f"{field}.std", std, 0.0, high - low)
         priors[key] = (value, std)
     return priors
 
@@ -272,7 +278,7 @@ def _list_effects(path: Path, names: Any, model: Model) -> Model:
         raise bad_input(path, "effect_list", names, "is not a list of names", "list effects as strings")
     parameters, effects, files = {}, [], {}
     for name in names:
-        near = _near_effect(path, name)
+        near = _near_effect(path, require_name(path, "effect_list", name, "list effects as strings"))
         # Before anything is loaded: naming an effect file in a model runs it.
         require_trust(path, "effect_list", near)
         effect = _named(path, "effect_list", name, catalogue.get, near)

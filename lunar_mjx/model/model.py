@@ -12,8 +12,8 @@ import numpy as np
 from lunar_mjx.effects import catalogue, presets
 from lunar_mjx.effects.base import Effect
 from lunar_mjx.effects.joint.motor import MODES, WINDINGS
-from lunar_mjx.errors import bad_input, require_finite
-from lunar_mjx.model.ambient import SYNODIC_DAY
+from lunar_mjx.errors import bad_input, require_finite, require_within
+from lunar_mjx.model.ambient import SYNODIC_DAY, require_environment
 from lunar_mjx.model.posterior import Posterior
 from lunar_mjx.model.sun import SunSettings
 from lunar_mjx.resources import shipped
@@ -28,6 +28,20 @@ ROOM = 298.15
 ZERO_CELSIUS = 273.15
 """K; 0 degC, by definition."""
 GAINS = ("position_gain_Nm_rad", "velocity_gain_Nms_rad")
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelLimits:
+    """Settings beyond which no model of a rover lies: what is larger is in another unit, or torn."""
+
+    gain: float = 1e9
+    """N m/rad and N m s/rad: a thousand times what the stiffest joint of the shipped rovers is held with, and more."""
+    shortest_day: float = 1.0
+    longest_day: float = 1e11
+    """s: of the ambient temperature; as no clock counts 3000 years in logs."""
+
+
+MODEL_LIMITS = ModelLimits()
 """Names in `model.toml` of a joint group's two gains."""
 
 THERMAL_INTEGRATORS = ("heun", "euler")
@@ -310,6 +324,7 @@ def check_settings(model: Model, source: str | Path) -> None:
         for name, gain in zip(GAINS, gains, strict=True):
             if require_finite(source, f"control.{group}.{name}", gain) < 0.0:
                 raise bad_input(source, f"control.{group}.{name}", gain, "is negative", "give zero or more")
+            require_within(source, f"control.{group}.{name}", gain, 0.0, MODEL_LIMITS.gain)
 
 
 def _check_group(rover: Rover, field: str, group: str, value: Any, source: str | Path) -> None:
@@ -342,9 +357,16 @@ def _check_ambient(ambient: Sequence[float], source: str | Path) -> None:
                 "is not above absolute zero",
                 "give degrees Celsius above -273.15",
             )
-    require_finite(source, "ambient.noon_time_s", noon_time)
+        celsius = kelvin - ZERO_CELSIUS
+        require_environment(source, f"ambient.{field}_temperature_degC", "ambient_temperature_degC", celsius)
+    if noon < night:
+        celsius = round(noon - ZERO_CELSIUS, 6)
+        raise bad_input(source, "ambient.noon_temperature_degC", celsius, "is below that of the night", "swap the two")
+    longest = MODEL_LIMITS.longest_day
+    require_within(source, "ambient.noon_time_s", noon_time, -longest, longest)
     if require_finite(source, "ambient.period_s", period) <= 0.0:
         raise bad_input(source, "ambient.period_s", period, "is not positive", "give the length of the day in s")
+    require_within(source, "ambient.period_s", period, MODEL_LIMITS.shortest_day, longest)
 
 
 def settled(kind: str, spec: str | Path, marker: str) -> str:
@@ -417,6 +439,8 @@ def make_model(
     # The preset after the rover: a preset may state another gear.
     model = preset_values(rover_motors(model))
     model = dataclasses.replace(model, gains=_gains_of_gear(model, loaded))
+    # What the rover's own files say, by their name.
+    check_settings(model, loaded.folder)
     # Last, since gains that are given are meant as they are, whatever the gear.
     return model.replace(**changes, gains=given_gains)
 

@@ -16,6 +16,8 @@ from lunar_mjx.toml_fields import Fields
 _KEYS = ("parameters", "log", "std", "correlation")
 _ROUNDING = 1e-6
 """By which a written correlation may miss symmetry, a diagonal of one, or the least eigenvalue of zero."""
+LARGEST_STD = 1e15
+"""Beyond any parameter's range, in SI units; single precision still holds its square."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,8 +100,8 @@ def read_posterior(
         raise bad_input(path, "posterior.log", log, f"is not a list of {len(names)}", "write [true, false, ...]")
     std = np.array(fields.vector("std", len(names)))
     for name, is_log, size in zip(names, log, std, strict=True):
-        require_within(path, f"posterior.std of {name}", size, 0.0)
         effect, _, parameter = name.partition(".")
+        require_within(path, f"posterior.std of {name}", size, 0.0, LARGEST_STD)
         value = values[effect][parameter]
         # Found when the file is read: a draw would else be not a number, far from its cause.
         if is_log and np.min(value) <= 0.0:

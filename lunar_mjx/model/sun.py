@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 
-from lunar_mjx.errors import bad_input, require_finite, require_within
+from lunar_mjx.errors import UserError, bad_input, require_finite, require_name, require_within
 from lunar_mjx.model.ambient import SYNODIC_DAY
 from lunar_mjx.terrain import Dem, Terrain, read_dem
 from lunar_mjx.terrain.sky import Horizon, Sun, fixed_sun
@@ -57,7 +57,7 @@ class SunSettings:
 
     def __post_init__(self) -> None:
         for field in ("azimuth_deg", "north_deg"):
-            require_finite("sun", field, getattr(self, field))
+            require_within("sun", field, getattr(self, field), -360.0, 360.0)
         require_within("sun", "elevation_deg", self.elevation_deg, -90.0, 90.0)
         require_within("sun", "irradiance_W_m2", self.irradiance_W_m2, 0.0, 1e5)
         require_within("sun", "days", self.days, 0.0, 4000.0, above=True)
@@ -88,11 +88,15 @@ def read_sun(path: Path, table: Mapping[str, Any]) -> SunSettings:
         if kind is not float and not isinstance(value, kind):
             wanted = "a text in quotes" if kind is str else "true or false"
             raise bad_input(path, f"sun.{key}", value, f"is not {wanted}", f"give {wanted}")
-        values[key] = kind(value)
+        values[key] = require_finite(path, f"sun.{key}", value) if kind is float else value
     if "horizon_dem" in values:
+        require_name(path, "sun.horizon_dem", values["horizon_dem"], "name a file of heights")
         # Paths count from the file that says them.
         values["horizon_dem"] = str(path.parent.resolve() / values["horizon_dem"])
-    return SunSettings(**values)
+    try:
+        return SunSettings(**values)
+    except UserError as error:  # of the settings alone, which do not know the file
+        raise UserError(f"{path}: {error}") from None
 
 
 def make_sun(settings: SunSettings | None, terrain: Terrain) -> Sun | None:

@@ -320,6 +320,44 @@ MISTAKES: dict[str, tuple[dict[str, Any], list[str]]] = {
     "value of no group": ({"effects": {"motor": {"gear_ratio": {"arm": 3.0}}}}, ["gear_ratio.arm = 3.0", "drive"]),
     "grounds that are no list": ({"grounds": "ice"}, ["grounds = 'ice'", "is no list of names"]),
     "groups for one number": (soil(n={"drive": 1.0}), ["effects.soil.n", "give one number here"]),
+    "rover on two lines": ({"rover": "luvmi\nx"}, ["rover = 'luvmi", "no name of a file"]),
+    "rover with a byte of zero": ({"rover": "a\0b"}, ["rover = 'a\\x00b'", "no name of a file"]),
+    "rover longer than names are": ({"rover": "a" * 9000}, ["rover = 'aaa", "no name of a file"]),
+    "effect file with a byte of zero": ({"effect_list": ["a\0.py"]}, ["effect_list", "no name of a file"]),
+    "effect longer than names are": ({"effect_list": ["a" * 5000]}, ["effect_list", "no name of a file"]),
+    "gain beyond single precision": (
+        {"control": {"drive": {"velocity_gain_Nms_rad": 1e300}}},
+        ["control.drive.velocity_gain_Nms_rad = 1e+300", "1e+09 at most"],
+    ),
+    "noon hotter than any rover outlives": (
+        {"ambient": {"temperature_degC": 1e9}},
+        ["ambient.noon_temperature_degC", "no temperature in degC"],
+    ),
+    "noon colder than the night": (
+        {"ambient": {"noon_temperature_degC": -100.0, "night_temperature_degC": 100.0}},
+        ["ambient.noon_temperature_degC = -100.0", "below that of the night"],
+    ),
+    "noon of no time": (
+        {"ambient": {"noon_temperature_degC": 9.0, "night_temperature_degC": 0.0, "noon_time_s": 1e300}},
+        ["ambient.noon_time_s = 1e+300", "out of range"],
+    ),
+    "day shorter than a second": (
+        {"ambient": {"noon_temperature_degC": 9.0, "night_temperature_degC": 0.0, "period_s": 1e-300}},
+        ["ambient.period_s = 1e-300", "give 1 or more"],
+    ),
+    "ground twice": ({"grounds": ["ice", "ice"]}, ["grounds = ['ice', 'ice']", "names one twice"]),
+    "prior outside the bounds": (
+        {"priors": {"soil.n": {"value": 1e9, "std": 0.1}}},
+        ["priors.soil.n.value = 1000000000.0", "3 at most"],
+    ),
+    "prior wider than the bounds": (
+        {"priors": {"soil.n": {"value": 1.0, "std": 1e300}}},
+        ["priors.soil.n.std = 1e+300", "out of range"],
+    ),
+    "posterior without an end": (
+        {"posterior": {"parameters": ["soil.n"], "log": [True], "std": [1e300], "correlation": [[1.0]]}},
+        ["posterior.std of soil.n = 1e+300", "out of range"],
+    ),
 }
 
 

@@ -140,12 +140,25 @@ def _turned(settings: SunSettings, north_deg: float) -> list[float]:
         ({"latitude_deg": 3.0}, ["latitude_deg = 3.0", "without a date"]),
         ({"horizon": 1}, ["sun.horizon = 1", "not true or false"]),
         ({"days": 0.0}, ["days = 0.0"]),
+        ({"azimuth_deg": 10**400}, ["sun.azimuth_deg = 1000", "too large"]),
+        ({"azimuth_deg": 1e300}, ["azimuth_deg = 1e+300", "360 at most"]),
+        ({"north_deg": 1e300}, ["north_deg = 1e+300", "360 at most"]),
+        ({"horizon_dem": "a\0b"}, ["sun.horizon_dem = 'a\\x00b'", "no name of a file"]),
     ],
 )
 def test_bad_input_gets_one_sentence(tmp_path, table, parts):
     with pytest.raises(UserError) as caught:
         read_sun(tmp_path / "model.toml", table)
     text = str(caught.value)
-    assert "\n" not in text and text.endswith(".")
+    assert "\n" not in text and text.endswith(".") and text.startswith(str(tmp_path / "model.toml"))
     for part in parts:
         assert part in text, text
+
+
+@pytest.mark.parametrize("date", ["1000-01-01", "2300-01-01"])
+def test_a_date_beyond_the_ephemeris_is_refused(date):
+    pytest.importorskip("astropy", reason="the extra lunar-mjx[sky] is not installed")
+    from lunar_mjx.terrain.sky.ephemeris import sun_over
+
+    with pytest.raises(UserError, match=rf"date = '{date}' is outside the years 1900 to 2100"):
+        sun_over(date, np.zeros(1), -89.0, 0.0)

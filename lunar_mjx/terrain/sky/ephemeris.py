@@ -8,6 +8,8 @@ import numpy as np
 
 from lunar_mjx.errors import UserError, bad_input
 
+FIRST_YEAR, LAST_YEAR = 1900, 2100
+"""Years that the built-in ephemeris covers (ERFA, `epv00`)."""
 _ARGUMENTS = (
     (125.045, -0.0529921),
     (250.089, -0.1059842),
@@ -73,6 +75,9 @@ def sun_over(date: str, seconds: Any, latitude_deg: float, longitude_deg: float)
         start = Time(date, scale="utc")
     except ValueError:
         raise bad_input("sun", "date", date, "is no date", 'write it as "2027-11-23T06:00:00", in UTC') from None
+    if not FIRST_YEAR <= start.jyear <= LAST_YEAR:
+        problem = f"is outside the years {FIRST_YEAR} to {LAST_YEAR} of the ephemeris"
+        raise bad_input("sun", "date", date, problem, "give a date within them")
     # the Earth's rotation, for which tables would be fetched, plays no part
     with iers.conf.set_temp("auto_download", False):
         times = start.tdb + TimeDelta(np.asarray(seconds, float), format="sec")
