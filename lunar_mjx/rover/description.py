@@ -17,6 +17,8 @@ from lunar_mjx.errors import bad_input, require_file, require_finite
 
 HEAVIEST = 1e5
 """kg: no rover weighs as much as a train."""
+LARGEST = 1e3
+"""m: no rover is as long as that, and no wheel as wide."""
 GROUPS = ("drive", "steer", "suspension")
 MODES = ("position", "velocity", "torque", "current")
 MOTOR_KEYS = ("torque_constant_Nm_A", "resistance_ohm", "current_limit_A")
@@ -262,6 +264,13 @@ def text(path: Path, where: str, value: Any) -> str:
     if not isinstance(value, str) or not value:
         raise bad_input(path, where, value, "is not a name", "give a text in quotes")
     return value
+
+
+def texts(path: Path, where: str, value: Any) -> tuple[str, ...]:
+    """Returns a list of texts as a tuple, or raises `UserError`."""
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise bad_input(path, where, value, "is no list of texts", 'write ["one", "another"]')
+    return tuple(value)
 
 
 def number(path: Path, where: str, value: Any) -> float:

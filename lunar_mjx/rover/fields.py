@@ -26,6 +26,55 @@ def refuse_unused_fields(mjcf: Path, model: mujoco.MjModel) -> None:
         raise UserError(f"{mjcf}: {problems[0]} would be ignored; {_REMEDY[problems[0].split(' of ')[0]]}.")
 
 
+def refuse_impossible_fields(mjcf: Path, model: mujoco.MjModel) -> None:
+    """Raises `UserError` for numbers that single precision does not hold, and for joints that no mechanism has."""
+    for name in _ARRAYS:
+        values = np.asarray(getattr(model, name), np.float64)
+        # MuJoCo compiles "nan" with no more than a warning.
+        wrong = ~np.isfinite(values) | (np.abs(values) > np.finfo(np.float32).max)
+        if wrong.any():
+            problem = f"holds {float(values[wrong][0])} in {name}"
+            raise UserError(f"{mjcf}: {problem}, which is no number of a rover; correct it, or convert again.")
+    for j in range(model.njnt):
+        low, high = (float(v) for v in model.jnt_range[j])
+        field = f"the joint {model.joint(j).name!r}"
+        if low > high:
+            raise bad_input(mjcf, f"range of {field}", f"{low:g} {high:g}", "has its ends swapped", "swap them")
+        if model.jnt_stiffness[j] < 0.0:
+            value = float(model.jnt_stiffness[j])
+            raise bad_input(mjcf, f"stiffness of {field}", value, "is negative", "give zero or more")
+        first = int(model.jnt_dofadr[j])
+        if model.dof_damping[first] < 0.0:
+            value = float(model.dof_damping[first])
+            raise bad_input(mjcf, f"damping of {field}", value, "is negative", "give zero or more")
+
+
+_ARRAYS = (
+    "body_pos",
+    "body_quat",
+    "body_ipos",
+    "body_iquat",
+    "body_mass",
+    "body_inertia",
+    "jnt_axis",
+    "jnt_pos",
+    "jnt_range",
+    "jnt_stiffness",
+    "qpos_spring",
+    "dof_damping",
+    "dof_armature",
+    "geom_pos",
+    "geom_quat",
+    "geom_size",
+    "site_pos",
+    "site_quat",
+    "eq_data",
+    "eq_solref",
+    "eq_solimp",
+)
+"""Arrays of a compiled model that the physics and the pictures read."""
+
+
 _REMEDY = {
     "ref": "make the pose that is meant the zero of the joint, and shift range and springref with it",
     "actuatorfrcrange": "leave it out, and give the motor its current limit in rover.toml",

@@ -11,11 +11,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input, one_line, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file, require_name
 from lunar_mjx.resources import find, shipped
 from lunar_mjx.rover import description as toml
-from lunar_mjx.rover.description import GROUPS, HEAVIEST, MODES, WINDINGS
-from lunar_mjx.rover.fields import check_sizes, refuse_unused_fields
+from lunar_mjx.rover.description import GROUPS, HEAVIEST, LARGEST, MODES, WINDINGS
+from lunar_mjx.rover.fields import check_sizes, refuse_impossible_fields, refuse_unused_fields
 from lunar_mjx.rover.rover import DriveGroup, JointGroup, Loop, Rover, Wheel
 
 FORMAT = "lunar-mjx-rover/1"
@@ -96,6 +96,7 @@ def load_rover(name_or_path: str | Path) -> Rover:
         raise UserError(f"{mjcf}: MuJoCo cannot compile it ({reason}); {_CONVERT_AGAIN}.") from None
     # Before anything is read: a field that would be ignored makes another rover.
     refuse_unused_fields(mjcf, model)
+    refuse_impossible_fields(mjcf, model)
     mass = toml.at_least(path, "mass", data["mass"], 0.0, strict=True)
     if mass > HEAVIEST:
         raise bad_input(path, "mass", mass, f"is above {HEAVIEST:g} kg", "correct the masses, which are in kg")
@@ -107,27 +108,36 @@ def load_rover(name_or_path: str | Path) -> Rover:
     wheels = tuple(_wheel(path, f"wheels[{i}]", w, bodies, joints) for i, w in enumerate(_list(path, "wheels", data)))
     groups = _groups(path, data["groups"], model)
     _check_wheels_against_groups(path, wheels, groups)
-    points = _list(path, "chassis_points", data)
+    _check_wheels_against_tree(path, model, wheels, groups)
+    points = [
+        toml.numbers(path, f"chassis_points[{i}]", p, 3) for i, p in enumerate(_list(path, "chassis_points", data))
+    ]
+    for i, point in enumerate(points):
+        if max(map(abs, point)) > LARGEST:
+            problem = f"is more than {LARGEST:g} m from the chassis"
+            raise bad_input(path, f"chassis_points[{i}]", list(point), problem, "give it in m")
+    chassis = _known(path, "chassis", data["chassis"], bodies, "body")
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise UserError(f"{mjcf}: its first joint is not free, so that the rover could not drive; {_CONVERT_AGAIN}.")
+    if model.jnt_bodyid[0] != model.body(chassis).id:
+        raise bad_input(path, "chassis", chassis, "is not the body of the free joint", _CONVERT_AGAIN)
     standing_height = toml.number(path, "standing_height", data["standing_height"])
     check_sizes(path, model, wheels, standing_height)
     gravity, notes = _gravity(path, data, model)
     return Rover(
-        name=toml.text(path, "name", data["name"]),
+        name=require_name(path, "name", data["name"], "give a text in quotes"),
         folder=folder,
         mjcf=mjcf,
         wheels=wheels,
         groups=groups,
         joint_limits=_limits(model),
-        chassis=_known(path, "chassis", data["chassis"], bodies, "body"),
-        chassis_points=np.array([toml.numbers(path, f"chassis_points[{i}]", p, 3) for i, p in enumerate(points)]),
+        chassis=chassis,
+        chassis_points=np.array(points),
         loops=tuple(_loop(path, f"loops[{i}]", x, bodies) for i, x in enumerate(toml.tables(path, "loops", data))),
         mass=mass,
         standing_height=standing_height,
-        notes=(*(toml.text(path, "notes", n) for n in data.get("notes", [])), *notes),
-        drive_groups=tuple(
-            _drive_group(path, f"drive_groups[{i}]", g, {w.drive for w in wheels})
-            for i, g in enumerate(toml.tables(path, "drive_groups", data))
-        ),
+        notes=(*toml.texts(path, "notes", data.get("notes", [])), *notes),
+        drive_groups=_drive_groups(path, toml.tables(path, "drive_groups", data), model, {w.drive for w in wheels}),
         gravity=gravity,
         timestep=float(model.opt.timestep),
     )
@@ -164,11 +174,14 @@ def _wheel(path: Path, where: str, table: Any, bodies: set[str], joints: set[str
     known = set(Wheel.__dataclass_fields__)
     toml.check_keys(path, where, table, known, known - {"steer", "suspension"})
     roles = {k: _known(path, f"{where}.{k}", table[k], joints, "joint") for k in ("steer", "suspension") if k in table}
+    width = toml.at_least(path, f"{where}.width", table["width"], 0.0, strict=True)
+    if width > LARGEST:
+        raise bad_input(path, f"{where}.width", width, f"is above {LARGEST:g} m", "give it in m")
     return Wheel(
-        corner=toml.text(path, f"{where}.corner", table["corner"]),
+        corner=require_name(path, f"{where}.corner", table["corner"], "call it lf, rf, lr or rr"),
         body=_known(path, f"{where}.body", table["body"], bodies, "body"),
         radius=toml.at_least(path, f"{where}.radius", table["radius"], 0.0, strict=True),
-        width=toml.at_least(path, f"{where}.width", table["width"], 0.0, strict=True),
+        width=width,
         drive=_known(path, f"{where}.drive", table["drive"], joints, "joint"),
         steer=roles.get("steer"),
         suspension=roles.get("suspension"),
@@ -183,6 +196,9 @@ def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, .
     for name in (g for g in GROUPS if g in data):
         table, field = data[name], f"groups.{name}"
         toml.check_keys(path, field, table, _GROUP_KEYS, _GROUP_KEYS - set(_MOTOR_KEYS))
+        efficiency = toml.at_least(path, f"{field}.gear_efficiency", table["gear_efficiency"], 0.0, strict=True)
+        if efficiency > 1.0:
+            raise bad_input(path, f"{field}.gear_efficiency", efficiency, "is above 1", "give a fraction")
         motor = {k: toml.at_least(path, f"{field}.{k}", table[k], 0.0, strict=True) for k in _MOTOR_KEYS if k in table}
         groups.append(
             JointGroup(
@@ -194,9 +210,7 @@ def _groups(path: Path, data: Any, model: mujoco.MjModel) -> tuple[JointGroup, .
                 position_gain=toml.at_least(path, f"{field}.position_gain", table["position_gain"], 0.0, strict=False),
                 velocity_gain=toml.at_least(path, f"{field}.velocity_gain", table["velocity_gain"], 0.0, strict=False),
                 gear_ratio=toml.at_least(path, f"{field}.gear_ratio", table["gear_ratio"], 0.0, strict=True),
-                gear_efficiency=toml.at_least(
-                    path, f"{field}.gear_efficiency", table["gear_efficiency"], 0.0, strict=True
-                ),
+                gear_efficiency=efficiency,
                 rotor_inertia=toml.at_least(path, f"{field}.rotor_inertia", table["rotor_inertia"], 0.0, strict=False),
                 winding=toml.one_of(path, f"{field}.winding", table["winding"], WINDINGS),
                 **motor,
@@ -216,10 +230,54 @@ def _check_wheels_against_groups(path: Path, wheels: tuple[Wheel, ...], groups: 
         raise bad_input(path, "groups.drive.joints", ", ".join(driven), "are not the wheels' joints", _CONVERT_AGAIN)
 
 
-def _drive_group(path: Path, where: str, table: Any, driven: set[str]) -> DriveGroup:
-    toml.check_keys(path, where, table, {"name", "joints"}, {"name", "joints"})
-    joints = tuple(_known(path, f"{where}.joints", j, driven, "drive joint") for j in _list(path, "joints", table))
-    return DriveGroup(toml.text(path, f"{where}.name", table["name"]), joints)
+def _check_wheels_against_tree(
+    path: Path, model: mujoco.MjModel, wheels: tuple[Wheel, ...], groups: tuple[JointGroup, ...]
+) -> None:
+    """Holds names of corners apart, and each wheel's joints against the MJCF and the groups."""
+    motors = {group.name: group.joints for group in groups}
+    for i, wheel in enumerate(wheels):
+        where = f"wheels[{i}]"
+        if [w.corner for w in wheels].count(wheel.corner) > 1:
+            raise bad_input(path, f"{where}.corner", wheel.corner, "is the corner of two wheels", "give each its own")
+        if model.jnt_bodyid[model.joint(wheel.drive).id] != model.body(wheel.body).id:
+            raise bad_input(path, f"{where}.body", wheel.body, f"is not what {wheel.drive} turns", _CONVERT_AGAIN)
+        for role, joint in (("steer", wheel.steer), ("suspension", wheel.suspension)):
+            if joint is not None and joint not in motors.get(role, ()):
+                problem = f"is no joint of groups.{role}"
+                raise bad_input(path, f"{where}.{role}", joint, problem, f"correct the name or {_CONVERT_AGAIN}")
+            # Where loops are closed, a linkage may turn a wheel from a branch of its own.
+            if joint is not None and not model.neq and not _carries(model, joint, wheel.body):
+                raise bad_input(path, f"{where}.{role}", joint, f"does not carry {wheel.body}", _CONVERT_AGAIN)
+
+
+def _carries(model: mujoco.MjModel, joint: str, body: str) -> bool:
+    """Whether a body hangs on a joint in the MJCF's tree."""
+    carrier, at = int(model.jnt_bodyid[model.joint(joint).id]), int(model.body(body).id)
+    while at not in (0, carrier):
+        at = int(model.body_parentid[at])
+    return at == carrier
+
+
+def _drive_groups(path: Path, entries: list[Any], model: mujoco.MjModel, driven: set[str]) -> tuple[DriveGroup, ...]:
+    """Reads wheels that share a motor: the MJCF must tie them, and no wheel has two motors."""
+    equalities = np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT)
+    tied = {
+        frozenset(model.joint(int(k)).name for k in (model.eq_obj1id[e], model.eq_obj2id[e]) if k >= 0)
+        for e in equalities
+    }
+    groups: list[DriveGroup] = []
+    for i, table in enumerate(entries):
+        where = f"drive_groups[{i}]"
+        toml.check_keys(path, where, table, {"name", "joints"}, {"name", "joints"})
+        joints = tuple(_known(path, f"{where}.joints", j, driven, "drive joint") for j in _list(path, "joints", table))
+        shown = ", ".join(joints)
+        if len(set(joints)) < len(joints) or any(set(joints) & set(g.joints) for g in groups):
+            raise bad_input(path, f"{where}.joints", shown, "name a joint twice", "name each wheel's joint once")
+        # A motor's inertia and current are shared between wheels that turn together; without a tie they do not.
+        if any(frozenset((joints[0], joint)) not in tied for joint in joints[1:]):
+            raise bad_input(path, f"{where}.joints", shown, "are not tied in the MJCF", _CONVERT_AGAIN)
+        groups.append(DriveGroup(toml.text(path, f"{where}.name", table["name"]), joints))
+    return tuple(groups)
 
 
 def _loop(path: Path, where: str, table: Any, bodies: set[str]) -> Loop:

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from lunar_mjx.errors import bad_input
-from lunar_mjx.rover.description import at_least, check_keys, numbers, one_of, read_toml, tables, text
+from lunar_mjx.rover.description import LARGEST, at_least, check_keys, numbers, one_of, read_toml, tables, text
 from lunar_mjx.rover.rover import Rover
 
 FILE = "look.toml"
@@ -90,6 +90,11 @@ def _add(path: Path, where: str, part: Any, bodies: dict[str, Any], colours: dic
     if not isinstance(ring, int) or isinstance(ring, bool) or not 1 <= ring <= 200:
         raise bad_input(path, f"{where}.ring", ring, "is no number of copies", "give a whole number from 1 to 200")
     colour = one_of(path, f"{where}.colour", part["colour"], tuple(colours))
+    detail = part.get("detail", False)
+    if not isinstance(detail, bool):
+        raise bad_input(path, f"{where}.detail", detail, "is neither true nor false", "write true for a small part")
+    if max(size.max(), np.abs(at).max()) > LARGEST:
+        raise bad_input(path, f"{where}.size, at", f"{size} at {at}", f"is beyond {LARGEST:g} m", "give lengths in m")
     turned = [[0.0, 0.5 * math.pi, 0.0], [-0.5 * math.pi, 0.0, 0.0], [0.0, 0.0, 0.0]][axis]
     own = _turn(tilt) @ _turn(np.array(turned))
     names = _names(path, f"{where}.bodies", part["bodies"], bodies)
@@ -106,7 +111,7 @@ def _add(path: Path, where: str, part: Any, bodies: dict[str, Any], colours: dic
                 pos=turn @ at,
                 quat=quaternion,
                 rgba=[*colours[colour], 1.0],
-                group=LOOK.detail if part.get("detail") is True else 1,
+                group=LOOK.detail if detail else 1,
                 # Paint: a part of the look changes neither inertia nor contact.
                 mass=0.0,
                 contype=0,

@@ -100,6 +100,9 @@ PART = HEAD + '[[parts]]\nbodies = ["chassis"]\nkind = "box"\nsize = [1.0, 1.0, 
         (PART + "ring = 1000000\n", "ring"),
         (PART + 'script = "x"\n', "script"),
         (PART.replace("red = [1.0", "red = [nan"), "red"),
+        (PART.replace("size = [1.0", "size = [1e300"), "size, at = .* is beyond 1000 m"),
+        (PART + "at = [1e300, 0.0, 0.0]\n", "size, at = .* is beyond 1000 m"),
+        (PART + 'detail = "yes"\n', "detail = 'yes' is neither true nor false"),
     ],
 )
 def test_a_broken_look_is_one_sentence(broken, text: str, field: str) -> None:

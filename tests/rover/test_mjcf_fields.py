@@ -72,6 +72,93 @@ def test_a_height_that_is_not_the_wheels_is_refused(rover):
         load_rover(rover)
 
 
+NUMBERS = {
+    "range nan": ('range="-0.7 0.7"', 'range="nan 0.7"', "holds nan in jnt_range"),
+    "range swapped": (
+        'range="-0.7 0.7"',
+        'range="0.7 -0.7"',
+        "range of the joint 'lf_suspension' = '0.7 -0.7' has its",
+    ),
+    "stiffness nan": ('stiffness="20"', 'stiffness="nan"', "holds nan in jnt_stiffness"),
+    "stiffness beyond single precision": ('stiffness="20"', 'stiffness="1e300"', "holds 1e+300 in jnt_stiffness"),
+    "stiffness below zero": ('stiffness="20"', 'stiffness="-20"', "stiffness of the joint 'lf_suspension' = -20.0 is"),
+    "springref nan": ('springref="0.1511908784"', 'springref="nan"', "holds nan in qpos_spring"),
+    "damping below zero": ('damping="10"', 'damping="-10"', "damping of the joint 'lf_suspension' = -10.0 is negative"),
+    "no free joint": ('<freejoint name="free"/>', "", "its first joint is not free"),
+    "hinge for a free joint": (
+        '<freejoint name="free"/>',
+        '<joint name="free" type="hinge"/>',
+        "first joint is not free",
+    ),
+}
+
+
+@pytest.mark.parametrize("field", NUMBERS)
+def test_numbers_that_no_mechanism_has_are_refused(rover, field, monkeypatch):
+    monkeypatch.chdir(rover)  # where MuJoCo writes of its warnings
+    old, new, said = NUMBERS[field]
+    _change(rover, "luvmi_x.xml", re.escape(old), new)
+    with pytest.raises(UserError, match=re.escape(said)) as error:
+        load_rover(rover)
+    assert str(rover / "luvmi_x.xml") in str(error.value)
+
+
+FLEET = 'loops = []\ndrive_groups = [{name = "left", joints = [%s]}]'
+DESCRIBED = {
+    "notes that are a number": ("notes = []", "notes = 5", "notes = 5 is no list of texts"),
+    "notes that are one text": ("notes = []", 'notes = "abc"', "notes = 'abc' is no list of texts"),
+    "two wheels of one corner": ('corner = "rf"', 'corner = "lf"', "corner = 'lf' is the corner of two wheels"),
+    "a corner on two lines": ('corner = "rf"', r'corner = "r\\nf"', "wheels[1].corner = 'r\\nf' is no name"),
+    "a name on two lines": ('name = "luvmi_x"', r'name = "a\\nb"', "name = 'a\\nb' is no name"),
+    "the body of another wheel": (
+        'body = "rf_wheel"',
+        'body = "lf_wheel"',
+        "body = 'lf_wheel' is not what rf_drive turns",
+    ),
+    "a steering joint that drives": (
+        'steer = "rf_steer"',
+        'steer = "rf_drive"',
+        "'rf_drive' is no joint of groups.steer",
+    ),
+    "a steering joint of another wheel": (
+        'steer = "rf_steer"',
+        'steer = "lf_steer"',
+        "'lf_steer' does not carry rf_wheel",
+    ),
+    "a suspension that is free": (
+        'suspension = "lf_suspension"',
+        'suspension = "free"',
+        "no joint of groups.suspension",
+    ),
+    "a gear that gains": (
+        "gear_efficiency = 0.75",
+        "gear_efficiency = 5.0",
+        "groups.drive.gear_efficiency = 5.0 is above",
+    ),
+    "a wheel of light years": ("width = 0.08", "width = 1e9", "wheels[0].width = 1000000000.0 is above 1000 m"),
+    "a chassis of light years": ("[-0.4, -0.3, 0.21]", "[-0.4, -0.3, 1e30]", "is more than 1000 m from the chassis"),
+    "a wheel for a chassis": ('chassis = "chassis"', 'chassis = "lf_wheel"', "'lf_wheel' is not the body of the free"),
+    "one joint twice in a group": ("loops = []", FLEET % '"lf_drive", "lf_drive"', "name a joint twice"),
+    "wheels that nothing ties": ("loops = []", FLEET % '"lf_drive", "lr_drive"', "are not tied in the MJCF"),
+}
+
+
+@pytest.mark.parametrize("field", DESCRIBED)
+def test_a_description_that_its_mjcf_contradicts_is_refused(rover, field):
+    old, new, said = DESCRIBED[field]
+    _change(rover, "rover.toml", re.escape(old), new)
+    with pytest.raises(UserError, match=re.escape(said)) as error:
+        load_rover(rover)
+    assert str(error.value).startswith(f"{rover / 'rover.toml'}: ")
+
+
+@pytest.mark.parametrize("step", ["0", "-1", "10"])
+def test_a_time_step_of_the_mjcf_is_refused_by_the_rovers_name(rover, step):
+    _change(rover, "luvmi_x.xml", 'timestep="0.002"', f'timestep="{step}"')
+    with pytest.raises(UserError, match=re.escape(f"{rover}: timestep_s = {float(step)} is outside")):
+        make_model(str(rover), "flat")
+
+
 def test_gravity_is_one_in_both_files(rover):
     _change(rover, "luvmi_x.xml", 'gravity="0 0 -1.625"', 'gravity="0 0 -3.7"')
     text = (rover / "rover.toml").read_text()
