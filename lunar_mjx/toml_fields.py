@@ -81,6 +81,20 @@ class Fields:
             raise bad_input(self.path, self.field(key), value, "is not a table", f"write it as [{self.field(key)}]")
         return Fields(self.path, value, self.field(key))
 
+    def tables(self, key: str, name: str = "") -> list[Fields]:
+        """The tables of an array, each with its place counted from one as `name`; empty if it is not there."""
+        values = self.values.get(key, [])
+        if not isinstance(values, list) or not all(isinstance(v, Mapping) for v in values):
+            raise bad_input(self.path, self.field(key), values, "is no list of tables", f"write [[{self.field(key)}]]")
+        return [Fields(self.path, v, f"{name or self.field(key)} {i + 1}") for i, v in enumerate(values)]
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """A list of texts; empty if it is not there."""
+        values = self.values.get(key, [])
+        if not isinstance(values, list) or not all(isinstance(v, str) for v in values):
+            raise bad_input(self.path, self.field(key), values, "is no list of texts", 'write ["one", "another"]')
+        return tuple(values)
+
     def text(self, key: str, default: str | None = None) -> str:
         """A text, which must be there if there is no default."""
         value = self.values.get(key, default)

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.effects.body.chassis import MOST_PAYLOAD
+from lunar_mjx.errors import UserError, bad_input, require_name, require_within
 from lunar_mjx.manoeuvres.stand import stand
 from lunar_mjx.model import Model
+from lunar_mjx.model.ambient import ENVIRONMENT, require_environment
 from lunar_mjx.rover import Rover, Wheel
 from lunar_mjx.simulate import SIMULATE, Commands
 from lunar_mjx.toml_fields import Fields
@@ -40,6 +42,25 @@ _TOP = (
 _SIDES = ("front", "rear", "left", "right")
 _QUANTITIES = {"speed_m_s": "velocity", "current_A": "current"}
 _SEGMENT = ("duration_s", "ramp_s", *_QUANTITIES, "steer_deg", "suspension_deg", "spin_deg_s")
+
+
+@dataclasses.dataclass(frozen=True)
+class ManoeuvreLimits:
+    """Commands beyond which no rover is driven: what is larger is in another unit, or torn."""
+
+    speed: float = 10.0
+    """m/s at the rim: rovers on the Moon and Mars drive below 5."""
+    current: float = 200.0
+    """A: of a rover's motor."""
+    turn: float = 360.0
+    """deg, of steering and suspension, and of the heading at the start."""
+    spin: float = 360.0
+    """deg/s: of a turn on the spot."""
+    start: float = 1e5
+    """m from the terrain's origin: a drive log stays within 100 km."""
+
+
+LIMITS = ManoeuvreLimits()
 
 Sided = float | Mapping[str, float]
 
@@ -113,25 +134,42 @@ def load_manoeuvre(name: str | Path) -> Manoeuvre:
         raise bad_input(path, "format", top.values.get("format"), "is not known", f'write format = "{FORMAT}"')
     start, environment = top.table("start"), top.table("environment")
     start.known(("x_m", "y_m", "yaw_deg"))
-    segments = top.values.get("segment")
-    if not isinstance(segments, list) or not segments:
+    environment.known(tuple(ENVIRONMENT))
+    parts = top.tables("segment", "segment")
+    if not parts:
         raise UserError(f"{path}: holds no [[segment]]; give at least one with duration_s.")
     arranged = top.table("arrangement")
     arranged.known(ARRANGEMENTS)
-    mode = top.table("modes").choice("drive", ("velocity", "current")) or "velocity"
-    parts = [Fields(path, s, f"segment {i + 1}") for i, s in enumerate(segments)]
+    modes = top.table("modes")
+    modes.known(("drive",))
+    mode = modes.choice("drive", ("velocity", "current")) or "velocity"
+    described = [_segment(p, mode) for p in parts]
+    longest = SIMULATE.most_commands * SIMULATE.interval
+    if (whole := sum(s.duration_s for s in described)) > longest:
+        raise bad_input(path, "sum of duration_s", whole, f"is above {longest:g} s", "give shorter segments")
     return Manoeuvre(
         name=path.stem,
         description=top.text("description", ""),
-        separates=tuple(map(str, top.values.get("separates", ()))),
-        terrain=top.text("terrain", "flat"),
-        start=(start.number("x_m", 0.0), start.number("y_m", 0.0), float(np.radians(start.number("yaw_deg", 0.0)))),
-        environment={k: environment.number(k) for k in environment.values},
-        payload_share=top.number("payload_share", 0.0),
+        separates=top.texts("separates"),
+        terrain=require_name(path, "terrain", top.text("terrain", "flat")),
+        start=(
+            _within(start, "x_m", LIMITS.start),
+            _within(start, "y_m", LIMITS.start),
+            float(np.radians(_within(start, "yaw_deg", LIMITS.turn))),
+        ),
+        environment={
+            k: require_environment(path, environment.field(k), k, environment.number(k)) for k in environment.values
+        },
+        payload_share=require_within(path, "payload_share", top.number("payload_share", 0.0), 0.0, MOST_PAYLOAD),
         drive_mode=mode,
         arrangement={k: {n: arranged.table(k).number(n) for n in arranged.table(k).values} for k in arranged.values},
-        segments=tuple(_segment(p, mode) for p in parts),
+        segments=tuple(described),
     )
+
+
+def _within(fields: Fields, key: str, most: float) -> float:
+    """A number of at most this size, zero if it is not there."""
+    return require_within(fields.path, fields.field(key), fields.number(key, 0.0), -most, most)
 
 
 def _segment(fields: Fields, mode: str) -> Segment:
@@ -149,21 +187,22 @@ def _segment(fields: Fields, mode: str) -> Segment:
     ramp = fields.number("ramp_s", 0.0)
     if not 0.0 <= ramp <= duration:
         raise bad_input(fields.path, fields.field("ramp_s"), ramp, "is not within the segment", "give 0 to duration_s")
-    drive = _sided(fields, next((q for q, m in _QUANTITIES.items() if m == mode), "speed_m_s"))
-    spin = float(np.radians(fields.number("spin_deg_s"))) if "spin_deg_s" in fields.values else None
+    most = LIMITS.speed if mode == "velocity" else LIMITS.current
+    drive = _sided(fields, next((q for q, m in _QUANTITIES.items() if m == mode), "speed_m_s"), most)
+    spin = float(np.radians(_within(fields, "spin_deg_s", LIMITS.spin))) if "spin_deg_s" in fields.values else None
     if spin is not None and mode != "velocity":
         raise bad_input(fields.path, fields.field("spin_deg_s"), spin, "needs drives in velocity mode", "set that mode")
-    steer, suspension = _radians(_sided(fields, "steer_deg")), _radians(_sided(fields, "suspension_deg"))
+    steer, suspension = (_radians(_sided(fields, key, LIMITS.turn)) for key in ("steer_deg", "suspension_deg"))
     return Segment(duration, ramp, drive, steer, suspension, spin)
 
 
-def _sided(fields: Fields, key: str) -> Sided:
+def _sided(fields: Fields, key: str, most: float) -> Sided:
     value = fields.values.get(key, 0.0)
     if not isinstance(value, Mapping):
-        return fields.number(key, 0.0)
+        return _within(fields, key, most)
     sides = fields.table(key)
     sides.known(_SIDES)
-    return {side: sides.number(side) for side in sides.values}
+    return {side: _within(sides, side, most) for side in sides.values}
 
 
 def _radians(value: Sided) -> Sided:
@@ -220,6 +259,9 @@ def commands(manoeuvre: Manoeuvre, model: Model, scale: float = 1.0) -> Commands
         raise bad_input(
             "manoeuvre", "scale", scale, f"leaves {scale * manoeuvre.duration_s:g} s", "give a larger scale"
         )
+    if count > SIMULATE.most_commands:
+        problem = f"makes it {scale * manoeuvre.duration_s:g} s"
+        raise bad_input("manoeuvre", "scale", scale, problem, "give a smaller scale")
     targets = [_targets(s, model) for s in manoeuvre.segments]
     ends = scale * np.cumsum([s.duration_s for s in manoeuvre.segments])
     out = np.empty((count, len(model.rover.joints)))
