@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import tomli_w
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file
 from lunar_mjx.files import write_text
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.readers.folder import ANSWER, LOG_FILE, read_log
@@ -68,6 +69,28 @@ def write_answer(answer: Answer, path: Path) -> None:
     write_text(path, tomli_w.dumps({"format": FORMAT, **dataclasses.asdict(answer)}))
 
 
+class _Hidden(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+    name: str
+    added: bool
+    parameters: dict[str, Any]
+
+
+class _Answer(BaseModel):
+    """Kinds of an answer's fields; what is hashed is the file's own content, which nothing converts."""
+
+    model_config = ConfigDict(strict=True)
+    log: str
+    nonce: str
+    seed: int
+    preset: str
+    manoeuvre: str
+    scale: float
+    effects: list[_Hidden]
+    recording: dict[str, Any]
+    data_sha256: str
+
+
 def read_answer(path: str | Path) -> Answer:
     """Reads an answer.
 
@@ -84,7 +107,19 @@ def read_answer(path: str | Path) -> Answer:
     for name in names:
         if name not in top.values:
             raise bad_input(path, name, None, "is missing", "give the answer as log simulate wrote it")
-    return Answer(**{n: top.values[n] for n in names})
+    given = {n: top.values[n] for n in names}
+    try:
+        _Answer.model_validate(given)
+        answer = Answer(**given)
+        answer.commitment()
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        problem = f"is not what an answer holds there ({first['msg'].lower()})"
+        raise bad_input(path, field, first["input"], problem, "give the answer as log simulate wrote it") from None
+    except TypeError as error:  # dates, which JSON does not know
+        raise UserError(f"{path}: {one_line(error)}; give the answer as log simulate wrote it.") from None
+    return answer
 
 
 def hash_tables(tables: Mapping[str, pd.DataFrame]) -> str:
@@ -151,8 +186,12 @@ def read_verdict(path: str | Path) -> tuple[str, list[str]]:
     require_file(path, "the verdict")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        return str(data["verdict"]), [str(e) for e in data.get("effects", [])]
-    except (ValueError, KeyError, TypeError, AttributeError):
+        label, effects = data["verdict"], data.get("effects", [])
+        # A text would be taken for its letters, and score as a wrong answer.
+        if not isinstance(label, str) or not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
+            raise TypeError
+        return label, effects
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise bad_input(
             path, "verdict", None, "is not there", 'give a JSON file with "verdict" and "effects"'
         ) from None

@@ -450,6 +450,7 @@ MISTAKES: dict[str, tuple[list[str], dict[str, object], list[str]]] = {
     "log in a split of no name": ([*RECORDED, "--split", "x"], {}, ["--split = 'x'", "fit, select, test"]),
     "bias of no channel": ([*RECORDED, "--bias", "foo=1"], {}, ["--bias = 'foo'", "is no channel"]),
     "bias with an underscore": ([*RECORDED, "--bias", "gyro_z_rad_s=1_0"], {}, ["--bias", "is not name=number"]),
+    "noise with an underscore": ([*RECORDED, "--noise", "scale:1_0"], {}, ["--noise = 'scale:1_0'", "is unknown"]),
     "bias beyond the channel": (
         ["log", "simulate", "OUT/log", "--rover", "luvmi_x", "--bias", "gyro_z_rad_s=1e300"],
         {},

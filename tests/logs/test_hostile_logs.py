@@ -15,6 +15,7 @@ from scipy.io import savemat
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, SteadyLog, check, import_drives, read_log
 from lunar_mjx.logs.findings import is_bad
+from lunar_mjx.logs.readers.bags import stamp
 from tests.cli_harness import Run
 from tests.logs.log_files import make_log
 
@@ -91,12 +92,24 @@ def test_a_last_row_that_is_half_written_is_left_out_and_named(cut: int, tmp_pat
         ("grouser_count = 4", f"grouser_count = {10**20}", "wheel.grouser_count = 1e\\+20 is out of range"),
         ("grouser_height_m = 0.01", "grouser_height_m = 5.0", "grouser_height_m = 5.0 is out of range; give .* 0.1 at"),
         ("[wheel]", "gravity_m_s2 = 981\n[wheel]", "gravity_m_s2 = 981.0 is above 100"),
+        ("noise.drawbar_pull_N", "noise.drawbar_pul_N", "noise.drawbar_pul_N = .* is the noise of no channel"),
+        ("std = 1.0", "std = 1e300", r"drawbar_pull_N.std = 1e\+300 is more than the channel's whole range"),
+        ('"points.csv"', '"a\\nb.csv"', "file = 'a.*b.csv' is no name of a file"),
+        ('"points.csv"', f'"{"a" * 300}.csv"', "file = 'aaa.* is no name of a file"),
     ],
 )
 def test_wheels_and_gravity_of_no_test_bed_are_refused(old: str, new: str, said: str, tmp_path: Path) -> None:
     assert old in STEADY
     with pytest.raises(UserError, match=said):
         steady(tmp_path / "bed", STEADY.replace(old, new))
+
+
+@pytest.mark.parametrize(("key", "std"), [("drawbar_pull_N", 2.0), ("drawbar_pull_kN", 0.002), ('"*_pull_N"', 2.0)])
+def test_noise_of_a_wheel_table_is_read_by_column_unit_and_pattern(key: str, std: float, tmp_path: Path) -> None:
+    log = steady(
+        tmp_path / "bed", STEADY.replace("noise.drawbar_pull_N", f"noise.{key}").replace("std = 1.0", f"std = {std}")
+    )
+    assert log.table.sigma == {"drawbar_pull": pytest.approx(2.0)}
 
 
 @pytest.mark.parametrize(
@@ -117,6 +130,26 @@ def test_wheels_and_gravity_of_no_test_bed_are_refused(old: str, new: str, said:
         ("std = 0.1", "std = 0.1\ncorrelated_share = 0.5", "share = 0.5 is of a part .* add correlation_time_s"),
         ("gravity", "terrain_origin_m = [1e300, 0]\ngravity", r"terrain_origin_m = 1e\+300 is out of range"),
         ("[noise", "[noise.wind]\nstd = 1.0\n[noise", "noise.wind = .* is the noise of no channel"),
+        (
+            "gravity",
+            f"magnitudes = {{ motor_lf_drive_current_A = {'9' * 400} }}\ngravity",
+            "magnitudes.motor_lf_drive_current_A = 9+... is too large",
+        ),
+        (
+            "gravity",
+            'magnitudes = { "motor_*_current_A" = 1e300 }\ngravity',
+            r"magnitudes.motor_\*_current_A = 1e\+300 is out of range; give 0 or more, 200 at most",
+        ),
+        (
+            "gravity",
+            "imu = { position_m = [1e300, 0, 0] }\ngravity",
+            "imu.position_m = .* is above 100; check its unit",
+        ),
+        ("gravity", "imu = { mounting_std_deg = [0, 200, 0] }\ngravity", "imu.mounting_std_deg = .* is above 180"),
+        ('"luvmi_x"', '"luvmi\\nx"', "rover = 'luvmi.*x' is no name of a file"),
+        ('"luvmi_x"', f'"{"a" * 5000}"', "rover = 'aaa.* is no name of a file"),
+        ("gravity", 'terrain = "a\\u0000b"\ngravity', "terrain = 'a.*b' is no name of a file"),
+        ('"drive.csv"', '"a\\u0000b"', "tables.drive.file = 'a.*b' is no name of a file"),
     ],
 )
 def test_what_no_rover_meets_is_refused(old: str, new: str, said: str, tmp_path: Path) -> None:
@@ -336,13 +369,28 @@ def test_damaged_recordings_are_refused_or_become_a_log(name: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    "data", [b"[" * 5000, b'{"speed": ' + b"9" * 5000 + b"}", b"\xff\xfe", b"[1]", b'{"speed": [1]}']
+    "data",
+    [
+        b"[" * 5000,
+        b'{"speed": ' + b"9" * 5000 + b"}",
+        b"\xff\xfe",
+        b"[1]",
+        b'{"speed": [1]}',
+        b'{"speed": %s}' % (b"9" * 400),
+        b'{"speed": "1_0"}',
+    ],
 )
 def test_messages_that_are_none_are_refused(data: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(_messages(data))
     (tmp_path / "map.toml").write_text(TOPIC)
     with pytest.raises(UserError, match=r"a\.mcap|map\.toml"):
         import_drives(tmp_path / "a.mcap", tmp_path / "log", tmp_path / "map.toml")
+
+
+@pytest.mark.parametrize("value", [10**400, 1e300, -1e12, {"sec": 10**400, "nanosec": 0}, {"sec": 0, "nsec": 10**400}])
+def test_a_stamp_of_no_clock_is_none(value: object) -> None:
+    with pytest.raises(KeyError, match="thousands of years"):
+        stamp(value)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import datetime
 import json
 import re
 import tomllib
@@ -14,7 +16,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, Recording, check, commands, log_model, read_log, simulate_log, unseal
 from lunar_mjx.logs.recorder import simulate as module
 from lunar_mjx.logs.recorder.instruments import RATES, parse_noise, record
-from lunar_mjx.logs.seal import answer_path, read_answer, score, write_answer
+from lunar_mjx.logs.seal import Answer, answer_path, read_answer, read_verdict, score, write_answer
 from lunar_mjx.manoeuvres import commands as manoeuvre_commands
 from lunar_mjx.manoeuvres import load_manoeuvre
 from lunar_mjx.model import make_model
@@ -188,6 +190,49 @@ def test_a_verdict_is_compared(fast: None, tmp_path: Path) -> None:
     (run / "verdict.json").write_text("[]")
     with pytest.raises(UserError, match="verdict"):
         unseal(answer_path(log), log, run)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"verdict": "KNOWN_CLASS", "effects": "com_offset"}',
+        '{"verdict": 5, "effects": []}',
+        '{"verdict": "KNOWN", "effects": {"com_offset": 1}}',
+        '{"verdict": "KNOWN", "effects": [1]}',
+        '{"effects": []}',
+        "[" * 100_000,
+    ],
+)
+def test_a_verdict_of_another_kind_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "verdict.json").write_text(text)
+    with pytest.raises(UserError, match=r'verdict\.json: verdict = None is not there; give a JSON file with "verdict"'):
+        read_verdict(tmp_path)
+
+
+ANSWER = Answer("a", "0" * 64, 3, "consistent", "slope", 1.0, [], {"dropouts": 0.0}, "0" * 64)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("effects", 5, "effects = 5 is not what an answer holds there"),
+        ("effects", "com_offset", "effects = 'com_offset' is not"),
+        ("effects", [{}], "effects.0.name = {} is not"),
+        ("effects", [{"name": "x", "added": "yes", "parameters": {}}], "effects.0.added = 'yes' is not"),
+        ("seed", "3", "seed = '3' is not"),
+        ("scale", "long", "scale = 'long' is not"),
+        ("recording", 5, "recording = 5 is not"),
+        ("recording", {"day": datetime.date(2027, 1, 1)}, "not JSON serializable"),
+    ],
+)
+def test_an_answer_of_another_kind_is_refused(field: str, value: object, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.answer.toml"
+    write_answer(ANSWER, path)
+    assert read_answer(path) == ANSWER
+    write_answer(dataclasses.replace(ANSWER, **{field: value}), path)
+    with pytest.raises(UserError, match=re.escape(said)) as caught:
+        read_answer(path)
+    assert str(caught.value).startswith(f"{path}: ") and "; give the answer as" in str(caught.value)
 
 
 def test_answers_come_back(fast: None, tmp_path: Path) -> None:

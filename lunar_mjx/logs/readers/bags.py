@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import math
 import re
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.logs.schema import LATEST
 
+T = TypeVar("T", int, float)
 Message = tuple[str, int, Any]
 """Topic, time of recording in ns, and the message: an object with fields, or a mapping."""
 
@@ -194,8 +195,8 @@ def stamp(value: Any) -> int:
       KeyError: it is none.
     """
     # A plain number means seconds, as JSON writers put it.
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return round(1e9 * value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and value == value:
+        return round(1e9 * _of_a_clock(value))
 
     def part(*names: str) -> int | None:
         for name in names:
@@ -207,4 +208,11 @@ def stamp(value: Any) -> int:
     whole, rest = part("sec", "secs"), part("nanosec", "nsec", "nsecs")
     if whole is None or rest is None:
         raise KeyError("it is neither a number of seconds nor a stamp of sec and nanosec")
-    return whole * 10**9 + rest
+    return _of_a_clock(whole) * 10**9 + _of_a_clock(rest)
+
+
+def _of_a_clock(seconds: T) -> T:
+    # Compared as they are: whole numbers of hundreds of digits have no float.
+    if not -LATEST <= seconds <= LATEST:
+        raise KeyError("it is thousands of years")
+    return seconds

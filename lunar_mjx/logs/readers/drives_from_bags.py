@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import bad_input
+from lunar_mjx.errors import bad_input, plain_digits
 from lunar_mjx.logs.readers.bags import field, messages, stamp
 from lunar_mjx.logs.readers.import_map import ImportMap, Source, Term
 from lunar_mjx.logs.readers.recorded_drive import LATITUDE, LONGITUDE, TIME, RecordedDrive, positions, without_empty
@@ -117,8 +117,8 @@ def _number(message: Any, channel: str, source: Source, mapping: ImportMap, tabl
         if value is None:
             return math.nan
         try:
-            number = float(value)
-        except (TypeError, ValueError):
+            number = float(plain_digits(value) if isinstance(value, str) else value)
+        except (TypeError, ValueError, OverflowError):
             raise bad_input(
                 mapping.path,
                 where,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.effects.catalogue import CATALOGUE
-from lunar_mjx.errors import UserError, bad_input, require_within
+from lunar_mjx.errors import UserError, bad_input, require_name, require_within
 from lunar_mjx.logs.attitude import body_attitude, with_angles
 from lunar_mjx.logs.findings import Finding
 from lunar_mjx.logs.log import Imu, Log, LogTable, Noise, SteadyLog
@@ -25,12 +25,13 @@ from lunar_mjx.logs.schema import (
     NOISE_KEYS,
     NOISE_SOURCES,
     SPLITS,
+    STEADY_CHANNELS,
     find_channel,
     is_quantity,
     limits,
     parse_column,
 )
-from lunar_mjx.model import ZERO_CELSIUS
+from lunar_mjx.model.ambient import ENVIRONMENT, require_environment
 from lunar_mjx.toml_fields import Fields
 
 LOG_FILE = "log.toml"
@@ -38,10 +39,10 @@ LEAST_NOISE = 1e-12
 """SI units: what is less is no instrument's noise but a zero, or rounding of double precision."""
 ANSWER = ".answer.toml"
 """How the answer to a sealed log is called, after the log."""
-ENVIRONMENT = ("ambient_temperature_degC", "sun_azimuth_deg", "sun_elevation_deg")
+FARTHEST_MOUNT_M = 100.0
+"""From the chassis to its IMU: no rover is as long."""
 FARTHEST_M = 2e7
 """Half of the Earth's circumference: no place on a grid lies beyond."""
-GREATEST_ANGLE = {"sun_azimuth_deg": 360.0, "sun_elevation_deg": 90.0}
 CHANGED = {
     "payload_kg": ("payload", "mass"),
     "payload_position_m": ("payload", "x"),
@@ -117,7 +118,7 @@ def read_log(folder: str | Path) -> Log | SteadyLog:
         raise bad_input(path, "format", top.values.get("format"), "is not known", f'write format = "{FORMAT}"')
     kind = top.text("kind", "drive")
     if kind == "steady_state":
-        return read_steady(folder, top, lambda f: _noise(f, None))
+        return read_steady(folder, top, lambda f: _noise(f, tuple(STEADY_CHANNELS)))
     if kind != "drive":
         raise bad_input(path, "kind", kind, "does not exist", "use drive (or leave it out) or steady_state")
     return _read_drive(folder, top)
@@ -176,10 +177,10 @@ def _read_drive(folder: Path, top: Fields) -> Log:
     return Log(
         folder=folder,
         name=folder.resolve().name,
-        rover=_near(folder, top.text("rover"), "rover.toml"),
+        rover=_near(folder, require_name(top.path, "rover", top.text("rover")), "rover.toml"),
         manoeuvre=top.text("manoeuvre", ""),
         gravity_m_s2=top.positive("gravity_m_s2", 1.625, GREATEST_GRAVITY),
-        terrain=_near(folder, top.text("terrain", "flat"), "terrain.toml"),
+        terrain=_near(folder, require_name(top.path, "terrain", top.text("terrain", "flat")), "terrain.toml"),
         terrain_origin_m=(origin[0], origin[1]),
         split=top.choice("split", SPLITS),
         environment=environment,
@@ -231,7 +232,8 @@ def _magnitudes(top: Fields, channels: Sequence[str]) -> dict[str, float]:
         matches = [c for c in channels if fnmatchcase(c, name)]
         if not matches and find_channel(name) is None:
             raise bad_input(top.path, "magnitudes", name, "is no channel", "correct its name or leave it out")
-        found |= dict.fromkeys(matches, float(floor))
+        for channel in matches:
+            found[channel] = require_within(top.path, f"magnitudes.{name}", floor, 0.0, limits(channel)[1])
     return found
 
 
@@ -283,25 +285,14 @@ def _tables(folder: Path, top: Fields, extra: dict[str, str], problems: list[Fin
 
 def _environment(fields: Fields) -> tuple[dict[str, float | str], dict[str, str]]:
     """Constants, and the columns that hold what is no constant, by key."""
-    fields.known(ENVIRONMENT)
+    fields.known(tuple(ENVIRONMENT))
     values: dict[str, float | str] = {}
     columns: dict[str, str] = {}
     for key, value in fields.values.items():
         if isinstance(value, str):
             values[key], columns[key] = key, value
         else:
-            values[key] = fields.number(key)
-            if most := GREATEST_ANGLE.get(key):
-                require_within(fields.path, fields.field(key), values[key], -most, most)
-    ambient = values.get("ambient_temperature_degC")
-    if isinstance(ambient, float) and not -ZERO_CELSIUS < ambient < 1000.0:
-        raise bad_input(
-            fields.path,
-            fields.field("ambient_temperature_degC"),
-            ambient,
-            "is no temperature in degC",
-            "give degrees Celsius above -273.15",
-        )
+            values[key] = require_environment(fields.path, fields.field(key), key, fields.number(key))
     return values, columns
 
 
@@ -368,6 +359,9 @@ def _imu(fields: Fields) -> Imu:
             "has a negative entry",
             "give zero or more degrees about x, y and z",
         )
+    for key, values, most in (("position_m", p, FARTHEST_MOUNT_M), ("mounting_std_deg", std, 180.0)):
+        if max(map(abs, values)) > most:
+            raise bad_input(fields.path, fields.field(key), list(values), f"is above {most:g}", "check its unit")
     attitude = fields.values.get("attitude", False)
     if not isinstance(attitude, bool):
         raise bad_input(
@@ -381,7 +375,7 @@ def _imu(fields: Fields) -> Imu:
     return Imu((p[0], p[1], p[2]), turn, (std[0], std[1], std[2]), attitude)
 
 
-def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
+def _noise(fields: Fields, channels: Sequence[str]) -> dict[str, Noise]:
     """Noise by channel; a key with `*` means every channel that it matches and that has no noise of its own."""
     exact: dict[str, Noise] = {}
     patterns: list[tuple[str, Noise]] = []
@@ -406,14 +400,14 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
         if "*" in key:
             patterns.append((key, Noise(std, source, correlation, share)))
             continue
-        column = parse_column(key, str(fields.path)) if channels is not None else None
-        if channels is not None and column is None and key not in channels:
+        column = None if key in channels else parse_column(key, str(fields.path))
+        if column is None and key not in channels:
             remedy = "list the names with lunar-mjx log channels"
             raise bad_input(fields.path, fields.field(key), entry.values, "is the noise of no channel", remedy)
         if column is not None and column.problem:
             raise bad_input(fields.path, fields.field(key), key, column.problem, "state the noise in that unit")
         name, scale = (column.name, column.scale) if column is not None else (key, 1.0)
-        low, high, _ = limits(name)
+        low, high = STEADY_CHANNELS[name][1:] if name in STEADY_CHANNELS else limits(name)[:2]
         if std * abs(scale) > high - low:
             raise bad_input(
                 fields.path, f"{fields.field(key)}.std", std, "is more than the channel's whole range", "check its unit"
@@ -421,7 +415,7 @@ def _noise(fields: Fields, channels: Sequence[str] | None) -> dict[str, Noise]:
         # Noise takes the unit's scale, never its offset.
         exact[name] = Noise(std * abs(scale), source, correlation, share)
     for pattern, noise in patterns:
-        for name in channels or ():
+        for name in channels:
             if fnmatchcase(name, pattern):
                 exact.setdefault(name, noise)
     return exact

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lunar_mjx.errors import UserError, bad_input, require_within
+from lunar_mjx.errors import UserError, bad_input, require_name, require_within
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import Noise, SteadyLog
 from lunar_mjx.logs.readers.table import cut_row, numbers, read_frame
@@ -60,7 +60,7 @@ def read_steady(folder: Path, top: Fields, read_noise: Callable[[Fields], dict[s
     """
     top.known(TOP)
     name = folder.resolve().name
-    path = folder / _file(top)
+    path = folder / require_name(top.path, "file", _file(top), "name the file of the table")
     wheel = top.table("wheel")
     wheel.known(WHEEL)
     size = {key: wheel.positive(key, most=BED_LIMITS.largest_wheel) for key in WHEEL[:2]}

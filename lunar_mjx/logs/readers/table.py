@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import UserError, bad_input, one_line, require_file, require_within
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file, require_name, require_within
 from lunar_mjx.logs.findings import WARNING, Finding
 from lunar_mjx.logs.log import LogTable
 from lunar_mjx.logs.schema import LATEST, limits, parse_column
@@ -108,7 +108,7 @@ def read_log_table(
     Raises:
       UserError: the file is missing or is no table, or has no column `time_s`.
     """
-    path = folder / entry.text("file")
+    path = folder / require_name(entry.path, entry.field("file"), entry.text("file"), "name a file of measurements")
     frame = read_frame(path, f"the table {name}")
     frame.columns = [str(c).strip() for c in frame.columns]
     if cut := cut_row(path, frame):

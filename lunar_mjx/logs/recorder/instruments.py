@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lunar_mjx.errors import bad_input, require_finite, require_within
+from lunar_mjx.errors import bad_input, plain_digits, require_finite, require_within
 from lunar_mjx.logs.log import Noise
 from lunar_mjx.logs.schema import is_command, limits
 
@@ -118,7 +118,7 @@ def parse_noise(text: str) -> float:
     head, _, tail = text.partition(":")
     try:
         if head == "scale":
-            return float(tail)
+            return float(plain_digits(tail))
     except ValueError:
         pass
     raise bad_input("log simulate", "--noise", text, "is unknown", "use datasheet, none or scale:5")
