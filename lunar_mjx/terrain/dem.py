@@ -31,6 +31,8 @@ class DemLimits:
     drives on has more."""
     largest: float = 1e12
     """Numbers other than heights that are larger count as marks of nodata; the stiffest soil has 1e9."""
+    farthest: float = 1e12
+    """Metres that no projection of a map exceeds, nor a count of its cells."""
     most_cells: int = 50_000_000
     """A grid of more nodes than this is refused before memory runs out."""
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
-from lunar_mjx.errors import bad_input, require_finite
+from lunar_mjx.errors import bad_input, require_finite, require_within
 from lunar_mjx.terrain import craters as cratering
 from lunar_mjx.terrain.craters import Craters
 from lunar_mjx.terrain.dem import DEM_LIMITS, Dem, require_cell, require_size, spline
@@ -72,6 +72,8 @@ def make_surface(
       UserError: an extent or spacing that is not positive, or leaves fewer than 2 x 2 or too many nodes.
     """
     require_cell("terrain", "cell", cell)
+    for axis, value in zip("xy", center, strict=True):
+        require_within("terrain", axis, value, -DEM_LIMITS.farthest, DEM_LIMITS.farthest)
     for field, value in (("width", width), ("height", height)):
         if require_finite("terrain", field, value) < cell:
             raise bad_input("terrain", field, value, f"is less than one cell of {cell:g} m", "make it larger")

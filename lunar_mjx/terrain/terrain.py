@@ -10,11 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lunar_mjx.errors import UserError, bad_input, require_finite
+from lunar_mjx.errors import UserError, bad_input, require_finite, require_within
 from lunar_mjx.pytree import pytree, static
+from lunar_mjx.terrain.dem import DEM_LIMITS, require_cell, require_size
 from lunar_mjx.terrain.heightfield import HeightField
 from lunar_mjx.terrain.rocks import Rocks, padded, with_forms
 from lunar_mjx.terrain.soil.maps import LAYERS, SoilGrids, SoilMap
+
+TURN = float(np.radians(360.0)) * (1.0 + 1e-9)
+"""rad."""
 
 
 @pytree
@@ -156,15 +160,19 @@ def inclined(
         raise bad_input(
             "slope", "angle", f"{np.degrees(angle):g} deg", "is a right angle or more", "give less than 90 deg"
         )
-    require_finite("slope", "direction", direction)
-    if require_finite("slope", "cell", cell) <= 0:
-        raise bad_input("slope", "cell", cell, "is not positive", "give the spacing in m")
+    # A turn to either side, and what rounding of degrees adds.
+    require_within("slope", "direction", direction, -TURN, TURN)
+    require_cell("slope", "cell", cell)
     if require_finite("slope", "extent", extent) < cell:
         raise bad_input("slope", "extent", extent, f"is less than one cell of {cell:g} m", "give it in m")
     # An even number of cells puts a node on the origin, and a third node keeps small grids legal.
     half = max(1, round(extent / cell / 2))
+    require_size("slope", 2 * half + 1, 2 * half + 1)
     at = np.arange(-half, half + 1) * cell
     rise = np.tan(angle)
+    if 2.0 * abs(rise) * at[-1] > DEM_LIMITS.most_relief:
+        problem = f"makes heights of {abs(rise) * at[-1]:.3g} m on {extent:g} m"
+        raise bad_input("slope", "angle", f"{np.degrees(angle):g} deg", problem, "give less, or a smaller extent")
     heights = rise * (np.cos(direction) * at[None, :] + np.sin(direction) * at[:, None])
     x0, y0, spacing = (jnp.asarray(v, dtype) for v in (at[0], at[0], cell))
     field = HeightField(jnp.asarray(heights, dtype), x0, y0, spacing)

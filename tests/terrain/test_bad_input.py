@@ -216,7 +216,14 @@ def test_slopes(spec):
         ({"seed": -1, "surface": SURFACE, "rocks": {}}, ["seed = -1"]),
         ({"plane": {}, "rocks": {}}, ["rocks", "does not go with [plane]"]),
         ({"plane": {"slope_deg": 120}}, ["120 deg"]),
+        ({"surface": SURFACE, "rocks": {"cell": 1e-5}}, ["rocks: grid = '100000", "larger cell"]),
+        ({"surface": SURFACE, "rocks": {"cell": 1e-9}}, ["rocks: cell = 1e-09", "no spacing"]),
+        ({"surface": SURFACE | {"x": 1e300}}, ["terrain: x = 1e+300", "out of range"]),
+        ({"plane": {"slope_deg": 89.99999}}, ["angle = '90 deg'", "makes heights of 5.73e+08 m on 200 m"]),
+        ({"plane": {"direction_deg": 1e300}}, ["direction = 1.7", "out of range"]),
         ({"plane": {"extent": -1.0}}, ["extent = -1.0"]),
+        ({"plane": {"extent": 1e9}}, ["grid = '1000000001 x 1000000001'", "larger cell"]),
+        ({"plane": {"extent": 1e300, "cell": 1e-300}}, ["cell = 1e-300", "no spacing of heights"]),
         ({"dem": {"cell": 1.0}}, ["dem.file", "leaves no ground"]),
         ({"dem": {"file": "no.tif"}}, ["no.tif", "not there"]),
         ({"surface": SURFACE, "crop": {"x": 99, "y": 0, "width": 2, "height": 2}}, ["crop x", "leaves the DEM"]),
@@ -271,3 +278,12 @@ def test_broken_toml(tmp_path):
 )
 def test_parameters(make, part):
     refused(make, part)
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [({"band": 2}, "band = 2 does not exist"), ({"band": -1}, "band = -1"), ({"height_scale": 5.0}, "is for PNG")],
+)
+def test_options_that_a_format_does_not_read_are_refused(options, part, tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 3)))
+    refused(lambda: read_dem(tmp_path / "a.npy", cell=1.0, **options), str(tmp_path / "a.npy"), part)

@@ -11,9 +11,6 @@ from lunar_mjx.errors import UserError, bad_input, plain_digits, require_finite,
 from lunar_mjx.terrain.dem import DEM_LIMITS, Dem, fill_holes, require_cell, require_size, undeclared_nodata
 from lunar_mjx.terrain.readers.options import WHERE, ReadOptions
 
-FARTHEST = 1e12
-"""Metres that no projection of a map exceeds, nor a count of its cells."""
-
 
 def read_npy(path: Path, options: ReadOptions) -> Dem:
     """Reads a two-dimensional array of heights in m; as in all readers, its first row is the north. See `read_dem`."""
@@ -98,7 +95,7 @@ def _header(path: Path, lines: list[str]) -> tuple[dict[str, float], list[str]]:
         if key == "nodata_value":
             header[key] = math.nan if words[1].lower() == "nan" else require_finite(path, words[0], words[1])
         else:
-            header[key] = require_within(path, words[0], words[1], -FARTHEST, FARTHEST)
+            header[key] = require_within(path, words[0], words[1], -DEM_LIMITS.farthest, DEM_LIMITS.farthest)
     return header, []
 
 

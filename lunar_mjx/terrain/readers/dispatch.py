@@ -25,6 +25,8 @@ _READERS: dict[str, Callable[[Path, ReadOptions], Dem]] = {
     ".asc": read_asc,
 }
 SUFFIXES = tuple(_READERS)
+BANDED = (".tif", ".tiff", ".xml")
+"""Suffixes of files that may hold several bands."""
 GRIDS = (".tif", ".tiff", ".npy", ".asc")
 """Suffixes of files that may hold other numbers than heights."""
 _LOG = logging.getLogger(__name__)
@@ -63,6 +65,11 @@ def read_dem(
             f"{', '.join(SUFFIXES)}."
         )
     require_file(path, "the DEM")
+    _require_band(path, band)
+    if height_scale is not None and path.suffix.lower() != ".png":
+        raise bad_input(
+            path, "height_scale", height_scale, "is for PNG: this format holds heights in m", "leave it out"
+        )
     window = crop if crop is None or isinstance(crop, Window) else Window(*crop)
     dem = reader(path, ReadOptions(cell, height_scale, dequantise, band, window))
     if window is not None:
@@ -90,4 +97,11 @@ def read_plain(path: Path, *, cell: float | None = None, band: int = 1, fill: bo
     if path.suffix.lower() not in GRIDS:
         raise bad_input(path, "suffix", path.suffix, "is no grid that is known", f"use one of {', '.join(GRIDS)}")
     require_file(path, "the grid")
+    _require_band(path, band)
     return _READERS[path.suffix.lower()](path, ReadOptions(cell, band=band, heights=False, fill=fill))
+
+
+def _require_band(path: Path, band: int) -> None:
+    # A reader of one band would take that for any, and a second layer would be the first once more.
+    if path.suffix.lower() not in BANDED and band != 1:
+        raise bad_input(path, "band", band, "does not exist: this format holds one", "leave it out, or give a GeoTIFF")

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.pytree import pytree
+from lunar_mjx.terrain.dem import require_cell, require_size
 from lunar_mjx.terrain.heightfield import Points, Scalar, grid_index, take
 from lunar_mjx.terrain.rocks.form import Form, forms_of, principal_axes
 
@@ -117,7 +118,8 @@ def build_rocks(
       dtype: of the result's floating-point arrays.
 
     Raises:
-      UserError: centres or radii of the wrong shape, not finite, or a radius that is not positive.
+      UserError: centres or radii of the wrong shape, not finite, or a radius that is not positive; a spacing that
+        leaves too many cells.
     """
     centers, radii = np.asarray(centers, np.float64).reshape(-1, 3), np.asarray(radii, np.float64).reshape(-1)
     if len(centers) != len(radii):
@@ -129,7 +131,9 @@ def build_rocks(
     if (radii <= 0).any():
         raise bad_input("rocks", "radii", radii.min(), "is not positive", "give radii in m above zero")
     west, south, east, north = bounds
+    require_cell("rocks", "cell", cell)
     cols, rows = (max(1, int(np.ceil((b - a) / cell))) for a, b in ((west, east), (south, north)))
+    require_size("rocks", rows, cols)
     # A cell's centre judges for its corners, which lie up to cell/sqrt(2) farther.
     index = _nearest_index(centers, radii, west, south, rows, cols, cell, reach + cell / np.sqrt(2))
     return Rocks(

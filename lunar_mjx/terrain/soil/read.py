@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
-from lunar_mjx.errors import UserError, bad_input, require_file, require_finite
+from lunar_mjx.errors import UserError, bad_input, plain_digits, require_file, require_finite
 from lunar_mjx.terrain.dem import Dem, require_cell
 from lunar_mjx.terrain.readers.dispatch import read_plain
 from lunar_mjx.terrain.soil.maps import SoilGrids, SoilMap
@@ -94,9 +94,9 @@ def read_grids(path: Path, layers: Sequence[Any], place: Place, ground: Dem) -> 
                 "leaves the numbers without a name",
                 f"name some of {', '.join(known)}",
             )
-        grids = {str(n): read_plain(path, cell=place.cell, band=k + 1) for k, n in enumerate(layers)}
-        if len(grids) < len(layers):
+        if len({str(n) for n in layers}) < len(layers):
             raise bad_input(path, "soil.grids.layers", list(layers), "names a parameter twice", "name each once")
+        grids = {str(n): read_plain(path, cell=place.cell, band=k + 1) for k, n in enumerate(layers)}
     for name, grid in grids.items():
         if name not in known:
             raise bad_input(path, "layer", name, "is no parameter of a soil", f"use some of {', '.join(known)}")
@@ -207,8 +207,8 @@ def _placed(values: Mapping[str, np.ndarray], grid: Dem, path: Path, place: Plac
 
 def _number(path: Path, key: str) -> float:
     try:
-        return float(int(key))
-    except ValueError:
+        return float(int(plain_digits(key)))
+    except (ValueError, OverflowError):
         raise bad_input(path, "soil.classes.soils", key, "is no whole number", "write CLASS = SOIL") from None
 
 
