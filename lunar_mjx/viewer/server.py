@@ -27,6 +27,7 @@ from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.errors import bad_input
 from lunar_mjx.viewer.drive import Drive, Pace
 from lunar_mjx.viewer.pilot import KEYS
+from lunar_mjx.viewer.replay import Replay
 from lunar_mjx.viewer.scene import dust_scene, ground_scene, rover_scene
 
 LOOPBACK = "127.0.0.1"
@@ -243,6 +244,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(200, self._viewer.scene.encode(), "application/json")
         elif url.path == "/ground":
             self._ground(url.query)
+        elif url.path == "/dust" and isinstance(self._viewer.drive, Replay):
+            self._dust(url.query, self._viewer.drive)
         elif url.path == "/pictures":
             self._pictures()
         else:
@@ -303,6 +306,17 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(400, "ask as /ground?x=0&y=0")
             return
         self._answer(200, self._viewer.ground(x, y).encode(), "application/json")
+
+    def _dust(self, query: str, drive: Replay) -> None:
+        try:
+            asked = parse_qs(query)
+            time, model = float(asked["time"][0]), int(asked["model"][0])
+            if not (math.isfinite(time) and 0 <= model < drive.models):
+                raise ValueError
+        except (KeyError, ValueError):
+            self._refuse(400, "ask as /dust?time=1.5&model=0")
+            return
+        self._answer(200, json.dumps(dust_scene(drive.thrown(time, model))).encode(), "application/json")
 
     def _pictures(self) -> None:
         """Server-sent events, one per picture, until the page or the drive ends."""

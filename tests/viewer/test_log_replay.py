@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lunar_mjx.cameras.dust.grains import Grains
 from lunar_mjx.diagnosis.report.driven import replayed
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import save_model
+from lunar_mjx.rover import load_rover
+from lunar_mjx.viewer.replay import Course, Replay
 from lunar_mjx.viewer.server import Viewer
 from tests.viewer.viewer_client import ask
 
@@ -100,8 +103,94 @@ def test_what_cannot_be_replayed_is_said(tmp_path):
         replayed(folder)
 
 
+def _straight(slip: float, speed: float = 0.5, noise: float = 0.0, seed: int = 0, without: str = "") -> Course:
+    """Ten seconds straight ahead with wheels that are known to turn faster than they roll, places off by some noise."""
+    rover = load_rover("luvmi_x")
+    time, random = np.linspace(0.0, 10.0, 101), np.random.default_rng(seed)
+    x, y = speed * time + random.normal(0.0, noise, 101), random.normal(0.0, noise, 101)
+    joints = {w.drive: (time, (1.0 + slip) * speed * time / w.radius) for w in rover.wheels}
+    joints |= {w.steer: (time, np.zeros(101)) for w in rover.wheels if w.steer}
+    joints.pop(without, None)
+    return Course("straight", time, x, y, np.zeros(101), joints, noise)
+
+
+def _thrown(course: Course, preset: str = "consistent") -> Grains:
+    model = make_model("luvmi_x", "flat", preset=preset)
+    return Replay(model, "straight", course, [_straight(0.0)], []).thrown(8.0, 0)
+
+
+def test_wheels_that_are_measured_to_slip_throw_dust_and_others_none():
+    rover = load_rover("luvmi_x")
+    grains = _thrown(_straight(0.6))
+    assert len(grains.area) > 20 and set(grains.wheel) == set(range(len(rover.wheels)))
+    # about the rover, which is 4 m on its way, and behind where it throws: no faster than its rim slips
+    assert (np.abs(grains.position[:, 0] - 4.0) < 2.0).all() and (grains.position[:, 2] >= 0.0).all()
+    assert np.linalg.norm(grains.velocity, axis=1).max() < 0.8 + 1.625 * 1.0
+    assert len(_thrown(_straight(0.0)).area) == 0
+    # twice the slip, more of it: the ground is the same
+    assert _thrown(_straight(1.2)).area.sum() > grains.area.sum()
+
+
+def test_noise_of_places_is_no_slip():
+    seen = [len(_thrown(_straight(0.0, noise=0.02, seed=s)).area) for s in range(5)]
+    assert seen == [0] * 5
+    assert len(_thrown(_straight(0.6, noise=0.02)).area) > 20
+
+
+def test_no_dust_where_slip_is_not_known_or_nothing_flies():
+    wheel = next(w for w in load_rover("luvmi_x").wheels if w.steer)
+    for joint in (wheel.drive, wheel.steer):
+        assert len(_thrown(_straight(0.6, without=joint)).area) == 0
+    model = make_model("luvmi_x", "flat")
+    for still in (model.replace(gravity=9.81), model.add("hard_surface")):
+        assert len(Replay(still, "straight", _straight(0.6), [_straight(0.6)], []).thrown(8.0, 0).area) == 0
+
+
+def test_speeds_of_wheels_in_a_run_turn_them(tmp_path):
+    """From the measured and the predicted series: a rover whose wheels stand throws none."""
+    folder = write_run(tmp_path / "run")
+    with np.load(folder / "series.npz") as kept:
+        stored = dict(kept)
+    rover, time = load_rover("luvmi_x"), np.linspace(0.0, SECONDS, 61)
+    rolling = 0.5 * np.pi * 4.0 / SECONDS
+    for joint, measured, predicted in [
+        *((f"joint_{w.corner}_drive_speed_rad_s", 1.5 * rolling / w.radius, 0.0) for w in rover.wheels),
+        *((f"joint_{w.corner}_steer_angle_rad", 0.0, 0.0) for w in rover.wheels if w.steer),
+    ]:
+        start = len(stored["measured"])
+        stored["measured"] = np.concatenate([stored["measured"], np.full(61, measured)])
+        stored["predicted"] = np.concatenate([stored["predicted"], np.full((2, 61), predicted)], axis=1)
+        for name, more in (("sigma", np.full(61, 0.1)), ("time", time), ("unit", np.zeros(61, int))):
+            stored[name] = np.concatenate([stored[name], more])
+        stored["series_start"] = np.append(stored["series_start"], start)
+        stored["series_channel"] = np.append(stored["series_channel"], joint)
+        stored["series_log"] = np.append(stored["series_log"], 0)
+    stored["residual"] = (stored["measured"] - stored["predicted"]) / 0.1
+    np.savez_compressed(folder / "series.npz", **stored)
+    shown = replayed(folder)
+    # places that are off by 10 cm hide 0.26 m/s of slip; by a millimetre they do not
+    assert len(shown.thrown(6.0, 1).area) == 0
+    sure = dict(stored, sigma=np.where(np.arange(len(stored["sigma"])) < 122, 1e-3, stored["sigma"]))
+    np.savez_compressed(folder / "series.npz", **sure)
+    shown = replayed(folder)
+    grains = shown.thrown(6.0, 1)
+    assert shown.scene["replay"]["dusty"] and len(grains.area) > 20
+    place = 4.0 * np.array([np.sin(0.25 * np.pi), 1.0 - np.cos(0.25 * np.pi)])
+    assert (np.linalg.norm(grains.position[:, :2] - place, axis=1) < 2.0).all()
+
+
+@pytest.fixture
+def dusty():
+    course = _straight(0.6)
+    yield from _served(Replay(make_model("luvmi_x", "flat"), "straight", course, [course], []))
+
+
 @pytest.fixture
 def served(replay):
+    yield from _served(replay)
+
+
+def _served(replay):
     viewer = Viewer(replay, port=0)
     thread = threading.Thread(target=viewer.run)
     thread.start()
@@ -119,6 +208,29 @@ def test_strangers_get_nothing_and_keys_move_nothing(served):
     assert ask(served, "POST", "/reset", {})[0] == 200
     told = json.loads(ask(served, "GET", "/scene")[2])
     assert len(told["replay"]["models"]) == 2 and told["rover"] == "luvmi_x"
+
+
+def test_dust_is_told_of_a_time_and_nonsense_refused(dusty):
+    told = json.loads(ask(dusty, "GET", "/dust?time=8&model=0")[2])
+    assert len(told) % 5 == 0 and len(told) > 100 and np.isfinite(told).all()
+    assert json.loads(ask(dusty, "GET", "/dust?time=8&model=0")[2]) == told
+    assert json.loads(ask(dusty, "GET", "/dust?time=-5&model=0")[2]) == []
+    for nonsense in ("", "?time=nan&model=0", "?time=1", "?time=1&model=1", "?time=1&model=-1", "?time=1&model=x"):
+        assert ask(dusty, "GET", f"/dust{nonsense}")[0] == 400
+
+
+@pytest.mark.slow
+def test_the_page_shows_dust_of_the_time_that_it_shows(dusty, browser):
+    seek = "const s = document.getElementById('when'); s.value = {}; s.dispatchEvent(new Event('input'));"
+    pause = "const p = document.getElementById('play'); if (p.textContent === 'pause') p.click();"
+    browser.open(dusty.address)
+    browser.wait("Number(document.body?.dataset.grains) > 20")
+    told = json.loads(ask(dusty, "GET", "/dust?time=8&model=0")[2])
+    browser.value(f"(() => {{ {pause} {seek.format(8)} }})()")
+    browser.wait(f"Number(document.body.dataset.grains) === {len(told) // 5}")
+    browser.value(f"(() => {{ {seek.format(0)} }})()")
+    browser.wait("Number(document.body.dataset.grains) === 0")
+    assert not browser.problems
 
 
 @pytest.mark.slow

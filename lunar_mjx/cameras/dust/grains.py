@@ -114,6 +114,7 @@ def judged(
     height: Float[Any, "*time wheel"],
     normal: Float[Any, "*time wheel 3"],
     radius: Float[Any, "wheel"],
+    quiet: float = SPRAY.quiet,
 ) -> Throw:
     """What wheels throw, from how they move over the ground.
 
@@ -121,6 +122,7 @@ def judged(
       xp: `numpy` or `jax.numpy`, which all the rest are arrays of.
       centre, axle, velocity: of the wheels, m, unit vectors and m/s. turning: of their drives, rad/s.
       height, normal: of the ground below them, m and unit vectors. radius: of the wheels, m.
+      quiet: slip up to which nothing is thrown, m/s.
     """
     sign = xp.where(turning < 0.0, -1.0, 1.0)[..., None]
     ahead = unit(xp, xp.cross(sign * axle, normal))
@@ -131,7 +133,7 @@ def judged(
     # By the distance to the plane of the ground, which on a slope is less than the height.
     clear = (centre[..., 2] - height) * normal[..., 2]
     # A rim that does not turn carries nothing up, however fast it skids; nor does a wheel that lies on its side.
-    carried = xp.minimum(slip, rim) - SPRAY.quiet
+    carried = xp.minimum(slip, rim) - quiet
     throws = (clear < radius + SPRAY.touch) & (up[..., 2] > SPRAY.upright) & (carried > 0.0)
     leave = xp.arccos(xp.clip(clear / radius, 0.5, 1.0))
     return Throw(centre, ahead, up, axle, along, rim, leave, xp.where(throws, carried, 0.0))

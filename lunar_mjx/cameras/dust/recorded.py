@@ -43,6 +43,7 @@ class Dust:
       time: of the rows, (time,) s, rising. motion: of the wheels, at these rows. gravity: m/s2, downwards.
       hard: whether all ground is rock, whatever the terrain says. seed: of which grain leaves where and how fast.
       before: slip of each wheel whose soil was thrown before the first row, (wheel,) m: rows that were dropped.
+      quiet: slip up to which nothing is thrown, m/s: more where motion was measured, and its noise would look like it.
 
     Attributes:
       way: slip whose soil was thrown until each row, (time, wheel) m; by it grains are numbered.
@@ -58,6 +59,7 @@ class Dust:
         hard: bool = False,
         seed: int = 0,
         before: Any = 0.0,
+        quiet: float = SPRAY.quiet,
     ) -> None:
         self._time, self._gravity, self._seed = np.asarray(time, float), float(gravity), seed
         self._ground = jax.device_get(terrain.field)
@@ -65,6 +67,7 @@ class Dust:
         self._radius = np.array([w.radius for w in rover.wheels])
         self.way = np.broadcast_to(before, (len(self._time), len(self._width)))
         self._throw: Throw | None = None
+        self._quiet = quiet
         if len(self._time) > 1 and gravity < SPRAY.heaviest and not hard:
             self._throw = self._judged(motion, jax.device_get(terrain.soil))
             # Of the way between two rows, so that it grows from row to row by what each is judged to throw.
@@ -78,8 +81,8 @@ class Dust:
         # Of a row and the one before it, since live pictures do not know the next.
         velocity = _held(np.diff(centre, axis=0) / step[..., None])
         turning = _held(np.diff(motion.angle, axis=0) / step)
-        height, normal = _ground(self._ground, centre[..., 0], centre[..., 1])
-        throw = judged(np, centre, motion.axle, velocity, turning, height, normal, self._radius)
+        height, normal = ground_below(self._ground, centre[..., 0], centre[..., 1])
+        throw = judged(np, centre, motion.axle, velocity, turning, height, normal, self._radius, self._quiet)
         if soil is None:
             return throw
         on_soil = _bilinear(soil.rock, soil, centre[..., 0], centre[..., 1])[0] < 0.5
@@ -124,7 +127,7 @@ class Dust:
         start, launch = released(np, Throw(*map(then, rows)), radius, width, (angle, slowness, place, side))
         fall = np.array([0.0, 0.0, -self._gravity])
         position = start + launch * age[:, None] + 0.5 * fall * (age**2)[:, None]
-        flies = (age >= 0.0) & (position[:, 2] > _ground(self._ground, position[:, 0], position[:, 1])[0])
+        flies = (age >= 0.0) & (position[:, 2] > ground_below(self._ground, position[:, 0], position[:, 1])[0])
         while flies.sum() > most:
             stride *= 2
             flies &= number % stride == 0
@@ -161,7 +164,7 @@ def _bilinear(values: Any, grid: Any, x: np.ndarray, y: np.ndarray) -> tuple[np.
     )
 
 
-def _ground(field: Any, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ground_below(field: Any, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Height of the ground, m, and its unit normal."""
     height, east, north = _bilinear(field.heights, field, x, y)
     return height, unit(np, np.stack([-east, -north, np.ones_like(east)], axis=-1))

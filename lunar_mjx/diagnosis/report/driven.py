@@ -10,6 +10,7 @@ from lunar_mjx.diagnosis.report.read import Result, Traces, read_result
 from lunar_mjx.diagnosis.report.words import channel_label
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.observations import Series
+from lunar_mjx.rover import Rover
 from lunar_mjx.viewer.replay import Course, Replay, Trace
 
 _MOST_TRACES = 4
@@ -41,8 +42,8 @@ def replayed(folder: str | Path, log: str = "") -> Replay:
         raise UserError(f"{folder}: its model cannot be loaded here, and brings the rover; run lunar-mjx compare anew.")
     name = traces.observations.logs[number]
     labels = [_label(result, label) for label in traces.labels]
-    courses = [_course(label, traces, number, row) for row, label in enumerate(labels)]
-    return Replay(model, name, _course("measured", traces, number, None), courses, _worst(traces, number))
+    courses = [_course(label, traces, number, row, model.rover) for row, label in enumerate(labels)]
+    return Replay(model, name, _course("measured", traces, number, None, model.rover), courses, _worst(traces, number))
 
 
 def _label(result: Result, label: str) -> str:
@@ -77,7 +78,7 @@ def _values(traces: Traces, series: Series, row: int | None) -> tuple[np.ndarray
     return traces.time[part][keep], value[keep]
 
 
-def _course(label: str, traces: Traces, log: int, row: int | None) -> Course:
+def _course(label: str, traces: Traces, log: int, row: int | None, rover: Rover) -> Course:
     along, across = (_series(traces, log, f"position_{a}_m") for a in "xy")
     assert along is not None and across is not None
     time, x = _values(traces, along, row)
@@ -89,7 +90,25 @@ def _course(label: str, traces: Traces, log: int, row: int | None) -> Course:
         yaw = np.interp(time, heading_time, np.unwrap(np.radians(degrees)))
     else:
         yaw = _direction(x, y)
-    return Course(label, time, x, y, yaw)
+    noise = 0.0 if row is not None else float(np.max(along.white))
+    return Course(label, time, x, y, yaw, _joints(traces, log, row, rover), noise)
+
+
+def _joints(traces: Traces, log: int, row: int | None, rover: Rover) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Times, s, and angles, rad, of drives and steered joints that the log tells, by the wheel or by its side."""
+    found = {}
+    for wheel in rover.wheels:
+        for joint, kind in ((wheel.drive, "drive"), (wheel.steer, "steer")):
+            for place in filter(None, (wheel.corner, wheel.side)) if joint is not None else ():
+                angle = _series(traces, log, f"joint_{place}_{kind}_angle_rad")
+                speed = _series(traces, log, f"joint_{place}_{kind}_speed_rad_s")
+                if angle is not None:
+                    found.setdefault(joint, _values(traces, angle, row))
+                elif speed is not None and kind == "drive":
+                    time, rate = _values(traces, speed, row)
+                    way = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
+                    found.setdefault(joint, (time, way[: len(time)]))
+    return {joint: known for joint, known in found.items() if len(known[0])}
 
 
 def _direction(x: np.ndarray, y: np.ndarray) -> np.ndarray:

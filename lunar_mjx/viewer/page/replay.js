@@ -3,7 +3,7 @@ import { clamp } from "./maths.js";
 import { unpack } from "./shapes.js";
 
 const INK = "#e8eaed", MODEL = "#56b4e9", RULE = "#3a4149", MUTED = "#aab2bb";
-const HIGH = 62, LOW = 34, GAP = 6, LEFT = 46, WIDE = 330, MOST_SIGMA = 6, PACES = [1, 2, 5, 10], STEP = 2;
+const HIGH = 62, LOW = 34, GAP = 6, LEFT = 46, WIDE = 330, MOST_SIGMA = 6, PACES = [1, 2, 5, 10], STEP = 2, STALE = 0.3;
 
 const byId = (id) => document.getElementById(id);
 const made = (tag, parent, more = {}) => parent.appendChild(Object.assign(document.createElement(tag), more));
@@ -123,7 +123,7 @@ class Plot {
 export class Replay {
   constructor(scene, view, onCamera) {
     const { replay } = scene, times = replay.time;
-    Object.assign(this, { scene, view, times, time: times[0], playing: true, pace: 0, model: replay.models.length - 1 });
+    Object.assign(this, { scene, view, times, time: times[0], playing: true, pace: 0, model: replay.models.length - 1, dust: [] });
     document.body.classList.add("replaying");
     byId("replay").hidden = byId("player").hidden = false;
     byId("replay-title").textContent = replay.title;
@@ -158,7 +158,7 @@ export class Replay {
   }
 
   choose(model) {
-    this.model = model;
+    Object.assign(this, { model, dust: [] });
     this.plots.forEach((plot) => plot.draw(model));
     this.show();
   }
@@ -172,6 +172,7 @@ export class Replay {
   seek(time) {
     this.time = clamp(time, this.times[0], this.times.at(-1));
     this.view?.restart();
+    this.dust = [];
     this.show();
   }
 
@@ -182,9 +183,29 @@ export class Replay {
     this.show();
   }
 
+  // Asks for the dust of the time that is shown, once the answer before is there; what is out of date is asked for anew.
+  async fetchDust() {
+    if (!this.scene.replay.dusty || !this.view || this.asking) return;
+    const { time, model } = this;
+    this.asking = true;
+    try {
+      const answer = await fetch(`/dust?time=${time}&model=${model}`);
+      const dust = answer.ok ? await answer.json() : [];
+      const late = model !== this.model || Math.abs(time - this.time) > STALE * PACES[this.pace];
+      this.dust = this.view.dust = late ? [] : dust;
+      document.body.dataset.grains = this.dust.length / 5;
+    } catch {
+      return;   // the server has ended
+    } finally {
+      this.asking = false;
+    }
+    if (!this.playing && (time !== this.time || model !== this.model)) this.fetchDust();
+  }
+
   show() {
     const measured = this.measured.at(this.time), ghost = this.models[this.model].at(this.time), body = this.scene.chassis;
-    this.view?.show(measured, { ghost });
+    this.view?.show(measured, { ghost, dust: this.dust });
+    this.fetchDust();
     const gap = Math.hypot(ghost[body][0] - measured[body][0], ghost[body][1] - measured[body][1]);
     byId("gap").textContent = `The model is ${gap.toFixed(2)} m away from where the rover was.`;
     byId("clock").textContent = `${(this.time - this.times[0]).toFixed(1)} of ${(this.times.at(-1) - this.times[0]).toFixed(1)} s`;
