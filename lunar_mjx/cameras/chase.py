@@ -17,7 +17,7 @@ from lunar_mjx.cameras.ground_map import MAP_COLOURS
 from lunar_mjx.cameras.pinhole import Pinhole, look_at
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.texture import Track
-from lunar_mjx.rover import Rover
+from lunar_mjx.rover import Rover, Wheel
 from lunar_mjx.terrain import Terrain
 
 
@@ -46,7 +46,12 @@ def wheel_tracks(rover: Rover, qpos: np.ndarray) -> list[Track]:
 
 def tracks_of(rover: Rover, places: np.ndarray) -> list[Track]:
     """The tracks of wheels whose centres went through places (time, wheel, 2 or 3) m."""
-    return [Track(places[:, i, :2], w.width, 0.25 * w.radius) for i, w in enumerate(rover.wheels)]
+    return [Track(places[:, i, :2], w.width, print_pitch(w)) for i, w in enumerate(rover.wheels)]
+
+
+def print_pitch(wheel: Wheel) -> float:
+    """Distance between the prints of a wheel's grousers, m."""
+    return 0.25 * wheel.radius
 
 
 class Chase:

@@ -9,9 +9,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lunar_mjx.cameras.chase import print_pitch
 from lunar_mjx.cameras.dust.grains import Grains
 from lunar_mjx.cameras.photometry import Film, Regolith
 from lunar_mjx.cameras.scene import SCENE_DETAIL, Patch, Sun, cut
+from lunar_mjx.cameras.texture import SOIL_TEXTURE
 from lunar_mjx.model import Model
 from lunar_mjx.rover.look import LOOK, seen_spec
 from lunar_mjx.terrain import Terrain
@@ -54,9 +56,17 @@ def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
         "shapes": shapes,
         "chassis": int(mj.body(rover.chassis).id),
         "wheels": [
-            {"corner": w.corner, "body": int(mj.body(w.body).id), "radius": w.radius, "width": w.width}
+            {
+                "corner": w.corner,
+                "body": int(mj.body(w.body).id),
+                "radius": w.radius,
+                "width": w.width,
+                "pitch": print_pitch(w),
+            }
             for w in rover.wheels
         ],
+        # Brightness on the screen over that of soil beside the track, as the other cameras show it.
+        "tracks": {"rut": SOIL_TEXTURE.rut / 255.0, "print": SOIL_TEXTURE.print / 255.0},
         "size": float(2.0 * np.abs(rover.chassis_points).max()),
         "sun": sun.direction.tolist(),
         "exposure": sun.exposure,

@@ -13,10 +13,14 @@ import jax
 import numpy as np
 import pytest
 
+from lunar_mjx.cameras.chase import tracks_of
+from lunar_mjx.cameras.scene import Sun, build_scene
+from lunar_mjx.cameras.texture import TrackPainter
 from lunar_mjx.errors import UserError
+from lunar_mjx.model import make_model
 from lunar_mjx.terrain import Terrain, build_rocks, flat, sample
 from lunar_mjx.viewer.drive import PACE
-from lunar_mjx.viewer.scene import ground_scene
+from lunar_mjx.viewer.scene import ground_scene, rover_scene
 from lunar_mjx.viewer.server import SERVER, Viewer
 from tests.viewer.viewer_client import ask, pictures
 
@@ -140,6 +144,33 @@ def test_rocks_are_sent_as_far_as_pictures_show_them():
     rocks = build_rocks(centres, np.full(3, 0.8), (-120.0, -120.0, 120.0, 120.0))
     terrain = jax.device_get(Terrain(ground.field, rocks, None, np.zeros(3), "boulders"))
     assert sorted(rock[0] for rock in ground_scene(terrain, 0.0, 0.0)["rocks"]) == [5.0, 50.0]
+
+
+def test_the_page_is_told_the_scene_of_the_other_cameras():
+    """The same Sun and rocks as MuJoCo's scene has, and tracks as its painter draws them."""
+    ground, sun = flat(60.0), Sun(200.0, 8.0)
+    centres = np.array([[5.0, 1.0, 0.2], [-8.0, 3.0, 0.1]])
+    rocks = build_rocks(centres, np.array([0.5, 0.8]), (-30.0, -30.0, 30.0, 30.0))
+    terrain = jax.device_get(Terrain(ground.field, rocks, None, np.zeros(3), "boulders"))
+    model = make_model("luvmi_x", "flat")
+    drawn, _ = build_scene(model.rover, terrain, np.zeros((1, 2)), sun)
+    told = rover_scene(model, sun)
+    np.testing.assert_allclose(told["sun"], -drawn.light_dir[0], atol=1e-6)
+    assert told["exposure"] == pytest.approx(drawn.light_diffuse[0, 0])
+    balls = [g for g in range(drawn.ngeom) if drawn.geom(g).name.startswith("rock_")]
+    sent = np.array(sorted(ground_scene(terrain, 0.0, 0.0)["rocks"]))
+    found = np.array(sorted([*drawn.geom_pos[g], drawn.geom_size[g, 0]] for g in balls))
+    np.testing.assert_allclose(sent[:, :3], found[:, :3], atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(sent[:, 3:6], axis=1), found[:, 3], atol=1e-3)
+    # a track along x over white ground, a texel every centimetre
+    way = np.stack([np.linspace(-4.0, 4.0, 401), np.zeros(401)], axis=-1)
+    wheel, side = told["wheels"][0], 1000
+    (track, *_) = tracks_of(model.rover, np.repeat(way[:, None], len(model.rover.wheels), axis=1))
+    white = np.full((side, side, 3), 255, np.uint8)
+    along = TrackPainter(white, (-5.0, -5.0), (10.0, 10.0), [track]).paint(401)[side // 2, :, 0] / 255.0
+    assert set(along.round(3)) == {1.0, *(round(shade, 3) for shade in told["tracks"].values())}
+    prints = np.flatnonzero(np.diff((along < told["tracks"]["rut"] - 0.01).astype(int)) == 1)
+    assert np.diff(prints).mean() == pytest.approx(100.0 * wheel["pitch"], rel=0.05)
 
 
 def _drive(viewer, clock, seconds):

@@ -7,7 +7,7 @@ import { cylinder, ground, pebbles, shapeOf, sphere } from "./shapes.js";
 
 const GROUND = [0.60, 0.585, 0.565], ROCK = GROUND.map((soil) => 1.5 * soil), STILL = pose([0, 0, 0], [1, 0, 0, 0]);
 const GHOST = [0.34, 0.71, 0.91], GHOSTLY = 0.55, POST = [0.03, 0.7], FLAG = [0.9, 0.62, 0.0];
-const ANGLE = 0.75, FETCH_AGAIN = 7, BAR = 0.022, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
+const ANGLE = 0.75, FETCH_AGAIN = 7, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
 
 async function json(path) {
   const answer = await fetch(path);
@@ -77,10 +77,10 @@ class View {
       const way = [here[0] - before[0], here[1] - before[1]], length = Math.hypot(...way);
       if (length < 1e-5 || length > 1) return;
       const unit = [way[0] / length, way[1] / length];
-      const first = Math.ceil(this.run[k] / BAR);
-      for (let bar = first; bar * BAR < this.run[k] + length; bar++) {
-        const s = bar * BAR - this.run[k];
-        this.prints.push([before[0] + s * unit[0], before[1] + s * unit[1], ...unit, wheel.width, BAR, bar % 3 ? 150 : 255]);
+      const long = wheel.pitch / 3, { rut, print } = this.scene.tracks;   // the texture has no room for finer prints
+      for (let bar = Math.ceil(this.run[k] / long); bar * long < this.run[k] + length; bar++) {
+        const s = bar * long - this.run[k], shade = 255 * (1 - (bar % 3 ? rut : print));
+        this.prints.push([before[0] + s * unit[0], before[1] + s * unit[1], ...unit, wheel.width, long, shade]);
         this.renderer.print(this.prints.at(-1));
       }
       this.run[k] += length;

@@ -92,7 +92,7 @@ float lit() {
 }
 void main() {
   vec3 n = normalize(facing), base = colour, toEye = normalize(eye - at);
-  float footprint = max(length(dFdx(at)), length(dFdy(at))), gloss = 0.12;
+  float footprint = max(length(dFdx(at)), length(dFdy(at))), gloss = 0.12, trodden = 1.0;
   if (kind == 1 || kind == 2) {
     gloss = 0.0;
     vec3 grain = regolith(at.xy, footprint);
@@ -105,8 +105,8 @@ void main() {
       float rut = texture(tracks, uv).r;
       vec2 across = vec2(texture(tracks, uv + vec2(e, 0.0)).r - texture(tracks, uv - vec2(e, 0.0)).r,
                          texture(tracks, uv + vec2(0.0, e)).r - texture(tracks, uv - vec2(0.0, e)).r);
-      n = normalize(n + 0.30 * vec3(across, 0.0));
-      base *= 1.0 - 0.30 * rut;
+      n = normalize(n + 0.80 * vec3(across, 0.0));
+      trodden = 1.0 - rut;
     }
   } else if (kind == 3) {
     gloss = 0.0;
@@ -124,19 +124,9 @@ void main() {
   // fill: light thrown back by the ground, so that shadows are dark but not holes
   float fill = 0.06 + 0.05 * (1.0 - n.z);
   vec3 sum = base * (exposure * 1.35 * facingSun * light + fill) + vec3(shine * light * exposure);
-  pixel = vec4(shown(sum), alpha);
+  // what is on the screen is darkened, as the other cameras' tracks are
+  pixel = vec4(shown(sum) * trodden, alpha);
 }`;
-
-const STAR_VERTEX = `#version 300 es
-layout(location = 0) in vec4 star;
-uniform mat4 camera;
-out float glow;
-void main() { gl_Position = (camera * vec4(star.xyz, 0.0)).xyww; gl_PointSize = 1.0 + star.w; glow = 0.25 + 0.45 * star.w; }`;
-const STAR_FRAGMENT = `#version 300 es
-precision highp float;
-in float glow;
-out vec4 pixel;
-void main() { pixel = vec4(vec3(glow), 1.0); }`;
 
 // Grains of dust as soft points. Light is scattered once: exp(-t) of what is behind comes through.
 const DUST_VERTEX = `#version 300 es
@@ -180,10 +170,8 @@ export class Renderer {
     Object.assign(this, { gl, canvas, sun, exposure, cloud });
     this.depth = this.program(DEPTH_VERTEX, DEPTH_FRAGMENT);
     this.surface = this.program(VERTEX, FRAGMENT);
-    this.sky = this.program(STAR_VERTEX, STAR_FRAGMENT);
     this.dust = this.program(DUST_VERTEX, DUST_FRAGMENT);
     this.grains = this.grainField();
-    this.stars = this.starField();
     this.shadowMap();
     this.trackMap();
     gl.enable(gl.DEPTH_TEST);
@@ -229,24 +217,6 @@ export class Renderer {
   free(mesh) {
     mesh.buffers.forEach((b) => this.gl.deleteBuffer(b));
     this.gl.deleteVertexArray(mesh.array);
-  }
-
-  starField() {
-    const { gl } = this, values = [];
-    let seed = 7;
-    const random = () => (seed = (seed * 48271) % 2147483647) / 2147483647;
-    for (let i = 0; i < 900; i++) {
-      const z = 2 * random() - 1, a = 2 * Math.PI * random(), r = Math.sqrt(1 - z * z);
-      values.push(r * Math.cos(a), r * Math.sin(a), z, random() ** 6);
-    }
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(values), gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribPointer(0, 4, gl.FLOAT, false, 0, 0);
-    gl.bindVertexArray(null);
-    return { array, count: values.length / 4 };
   }
 
   grainField() {
@@ -383,13 +353,9 @@ export class Renderer {
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, w, h);
-    gl.clearColor(0, 0, 0, 1);
+    gl.clearColor(0, 0, 0, 1);   // the sky: a camera that exposes for sunlit soil sees no stars
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.depthFunc(gl.LEQUAL);
-    gl.useProgram(this.sky.made);
-    gl.uniformMatrix4fv(this.sky.at.camera, false, camera);
-    gl.bindVertexArray(this.stars.array);
-    gl.drawArrays(gl.POINTS, 0, this.stars.count);
 
     const { at } = this.surface;
     gl.useProgram(this.surface.made);
