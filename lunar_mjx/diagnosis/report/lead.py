@@ -52,7 +52,7 @@ def lead(results: Sequence[Result], judge: Result) -> Lead:
 
 
 def _sentence(name: str, named: Sequence[str], port: str, added: Sequence[str]) -> str:
-    at_port = f" at the port {port}" if port else ""
+    acts = f" It acts at {port}, a step of the model (a port)." if port else ""
     since = f" now that it has {_and(added)}" if added else ""
     return {
         "NOISE_ONLY": f"The model explains these measurements down to their noise{since}.",
@@ -61,7 +61,7 @@ def _sentence(name: str, named: Sequence[str], port: str, added: Sequence[str]) 
         "KNOWN_CLASS": f"The model lacks one of {_or(named)}; these measurements cannot tell them apart."
         if len(named) > 1
         else f"The model lacks {_and(named)}, or something that is on no list.",
-        "UNKNOWN": f"The model lacks something{at_port} that no effect of the catalogue explains.",
+        "UNKNOWN": f"The model lacks something that no effect of the catalogue explains.{acts}",
         "UNDECIDABLE": "Nothing can be named from these measurements so far.",
         "BAD_FIT": "The fit of the model did not converge, so nothing is said about physics.",
         "BAD_DATA": "The logs contradict themselves, so nothing is said about physics.",

@@ -25,8 +25,8 @@ def reason(
     name, status = str(evidence.get("effect")), str(evidence.get("status"))
     shows = _number(evidence.get("separable_sigma"))
     if status == "not tested":
-        seen = "leaves no trace" if not shows else f"stands out by {shown(shows, 2)} sigma only"
-        return f"These measurements cannot tell: at its usual size it {seen} once the model has been refitted."
+        but = f" but {shown(shows, 2)} sigma" if shows else ""
+        return f"These measurements cannot tell: at its usual size, a refit of the model makes up for all{but} of it."
     sentences = []
     probability = _number(evidence.get("probability"))
     if name in named:
@@ -41,7 +41,9 @@ def reason(
             )
         return " ".join([*sentences, *_probable(probability)])
     if shows:
-        sentences.append(f"At its usual size it would stand out by {shown(shows, 2)} sigma.")
+        sentences.append(
+            f"At its usual size it would change all these measurements together by {shown(shows, 2)} sigma."
+        )
     if name in errors and before is not None:
         left = errors[name]
         falls = left < 0.98 * before
@@ -53,13 +55,15 @@ def reason(
     near, cosine = _nearest(evidence)
     if near and cosine >= ALIKE:
         more = (
-            "which is named"
+            "which the measurements ask for"
             if near in named
-            else "which is not named either"
+            else "which they do not ask for either"
             if named
-            else "so either may stand for both"
+            else "so these measurements cannot tell the two apart"
         )
-        sentences.append(f"Its trace looks like that of {_plain(near)} (alike to {cosine:.2f} of 1), {more}.")
+        sentences.append(
+            f"What it changes looks like what {_plain(near)} changes (alike to {cosine:.2f} of 1), {more}."
+        )
     note = str(evidence.get("reason") or "")
     if probability is None and note:
         sentences.append(f"The diagnosis notes: {note[:200]}.")
@@ -71,7 +75,8 @@ def _probable(probability: float | None) -> list[str]:
         return []
     if probability >= SURE:
         return [f"Its probability is {percent(probability)}."]
-    words = "more than the 5 % that would rule it out" if probability > 1.0 - SURE else "so it is ruled out"
+    limit = f"{100.0 * (1.0 - SURE):.0f} %"
+    words = f"too much to rule it out (below {limit})" if probability > 1.0 - SURE else "so it is ruled out"
     return [f"Its probability is {percent(probability)}, {words}."]
 
 

@@ -40,7 +40,7 @@ function shade(value, most) {
 function drawProbabilities() {
   const box = $("probabilities");
   if (!data.hypotheses.length) {
-    add(box, "p", "These hypotheses were not given probabilities by the run.", "note");
+    add(box, "p", "Probabilities are not known yet: lunar-mjx why finds them.", "note");
     return;
   }
   const stack = add(box, "div");
@@ -172,7 +172,7 @@ function showFall() {
   const most = Math.max(1.2, ...data.models.slice(0, data.base + 1).map(m => m[key] || 0), chosen[key] || 0);
   const before = box.dataset.width || "100%";
   box.textContent = "";
-  add(box, "p", "Error on " + (held ? "held-out manoeuvres, never fitted" : "fitted manoeuvres") + ", in sigma; the dashed line is the noise.", "note");
+  add(box, "p", "Error on manoeuvres that were " + (held ? "held out, so no fit has seen them" : "fitted") + ". The dashed line, 1 σ (sigma), is the noise of the measurements.", "note");
   const grid = add(box, "div", undefined, "fall");
   for (const [name, m] of rows) {
     add(grid, "span", name);
@@ -186,7 +186,7 @@ function showFall() {
     } else bar.style.width = width;
     add(grid, "span", shown(m[key]) + " σ", "number");
   }
-  if (chosen.kind === "estimate") add(box, "p", "An estimate: nobody refitted the model with this effect. It is what the best amount of the effect's trace leaves of the fitted manoeuvres.", "note");
+  if (chosen.kind === "estimate") add(box, "p", "An estimate: the model was not refitted with this effect. What it changes in the fitted manoeuvres, its trace, was scaled until the error was least.", "note");
 }
 function showWhy() {
   const box = $("why");
@@ -287,7 +287,7 @@ function showMap() {
       colorbar: {title: {text: "sigma"}, tickvals: [0, 0.30103, 0.69897, 1, 1.30103, 2], ticktext: ["1", "2", "5", "10", "20", "100"], thickness: 12}}};
   const square = map.equal ? {scaleanchor: "x", scaleratio: 1} : {};
   Plotly.react("place", [points], Object.assign(figure(), {
-    margin: {l: 62, r: 10, t: 44, b: 46}, title: {text: "where: error over all channels", font: {size: 14}, x: 0, xanchor: "left"},
+    margin: {l: 62, r: 10, t: 44, b: 46}, title: {text: "where it happened: error over all channels", font: {size: 14}, x: 0, xanchor: "left"},
     xaxis: Object.assign({title: {text: map.x_title}}, axis), yaxis: Object.assign({title: {text: map.y_title}}, axis, square)}), config());
   place.setAttribute("aria-label", "Error by place; " + data.units[column].name + " is drawn larger");
 }

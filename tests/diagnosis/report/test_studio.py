@@ -71,8 +71,8 @@ def test_refits_of_other_observations_are_left_alone_and_damaged_ones_refused(tm
         ({"effect": "toe", "status": "not tested", "separable_sigma": 0.4}, "cannot tell"),
         ({"effect": "drag", "status": "accepted", "probability": 0.97}, "falls from 8 to 1 sigma"),
         ({"effect": "toe", "status": "rejected", "probability": 0.001}, "leaves 6 of 8 sigma, where drag leaves 1"),
-        ({"effect": "toe", "status": "rejected", "probability": 0.2}, "more than the 5 % that would rule it out"),
-        ({"effect": "toe", "status": "rejected", "nearest": ["drag", 0.97]}, "looks like that of drag"),
+        ({"effect": "toe", "status": "rejected", "probability": 0.2}, "too much to rule it out (below 5 %)"),
+        ({"effect": "toe", "status": "rejected", "nearest": ["drag", 0.97]}, "looks like what drag changes"),
         ({"effect": "toe", "status": "rejected", "probability": "x", "nearest": 3, "separable_sigma": []}, "leaves 6"),
     ],
 )
