@@ -5,6 +5,7 @@ from lunar_mjx.cameras.batch import Pictures as Pictures
 from lunar_mjx.cameras.batch import painted as painted
 from lunar_mjx.cameras.batch import picture as picture
 from lunar_mjx.cameras.batch import pictures as pictures
+from lunar_mjx.cameras.batch import rutted as rutted
 from lunar_mjx.cameras.batch import stereo as stereo
 from lunar_mjx.cameras.batch import trodden as trodden
 from lunar_mjx.cameras.camera import LABELS as LABELS

@@ -8,8 +8,8 @@ would gather; Earth shines without shadows. Dust that wheels throw up veils what
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from lunar_mjx.cameras.raymarch import in_parts, mounted
 from lunar_mjx.cameras.rays.trace import GROUND, ROCK, ROVER, SKY, sunlit, trace
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.shapes import Placed, bodies, placed, rover_shapes, together
-from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
+from lunar_mjx.cameras.texture import ALBEDO, SOIL_TEXTURE, Track, TrackPainter, regolith
 from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import HeightField, Terrain, sample
 
@@ -44,6 +44,8 @@ class BatchView:
     """Share of painted ground, at each side, over which its mottling fades out."""
     horizon: float = 0.02
     """Share of the sky that lit slopes fill, as level ground sees it."""
+    rut: float = 0.002
+    """Depth of pressed soil at which a rut is as dark as `RoverCamera` draws tracks, m; a shallower one is less."""
 
 
 BATCH_VIEW = BatchView()
@@ -64,6 +66,14 @@ class Light:
     earthshine: float = 1e-4
     soil: Regolith = dataclasses.field(default_factory=Regolith)
     film: Film = dataclasses.field(default_factory=Film)
+
+
+class Ruts(Protocol):
+    """What wheels did to the ground, such as `Relief` of the effect `ruts`; a pytree."""
+
+    def at(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Height of soil moved and depth pressed, m, at points of any shape."""
+        ...
 
 
 class Pictures(NamedTuple):
@@ -87,7 +97,7 @@ def picture(
     light: Light | None = None,
     rovers: Placed | None = None,
     sun: Any = None,
-    paint: HeightField | None = None,
+    paint: HeightField | Callable[[Any, Any], Any] | None = None,
     key: Any = None,
     far: float = 60.0,
     lit: bool = True,
@@ -102,7 +112,8 @@ def picture(
       camera: optics. light: what shines, and how the camera exposes.
       rovers: shapes in the world, see `placed` and `together`; none if None.
       sun: (3,) unit vector towards the Sun in place of `light.sun`, so that it may differ between cameras of a batch.
-      paint: brightness of the ground over that of plain soil, such as mottling and wheel tracks; see `painted`.
+      paint: brightness of the ground over that of plain soil, such as mottling and wheel tracks: a grid, see
+        `painted` and `trodden`, or a function of x and y, m, see `rutted`.
       key: random key of the noise; no noise if None.
       far: largest depth that is looked for, m.
       lit: whether colour is sought; without it no ray asks for shadows.
@@ -147,6 +158,7 @@ def pictures(
     others_qvel: Float[Array, "rover other nv"] | None = None,
     gravity: Any = SPRAY.gravity,
     grains: int = 24,
+    ruts: Ruts | None = None,
     **more: Any,
 ) -> Pictures:
     """What the front cameras of many rovers see of ground, rocks, themselves and each other.
@@ -161,6 +173,7 @@ def pictures(
       qvel: velocities of the MJCF, if the soil that wheels throw up is to be seen; see `steady_dust`.
       others_qvel: those of the others. gravity: under which it flies, m/s2.
       grains: drawn of each wheel; more look finer in large pictures, and take time.
+      ruts: that each rover knows of, leading axis `rover`: its pressed soil is darker. Their depth is not drawn.
       more: `far`, `paint` and `lit` of `picture`.
     """
     # Small by default: pictures for learning, not for looking.
@@ -168,7 +181,7 @@ def pictures(
     camera_mount = mount or front_mount(rover)
 
     def one(given: tuple) -> Pictures:
-        own, own_velocity, other, other_velocity = given
+        own, own_velocity, other, other_velocity, pressed = given
         position, turn = mounted(camera_mount, own)
         seen = [placed(shapes, rover, own)]
         flying = [] if own_velocity is None else [steady_dust(terrain, rover, own, own_velocity, gravity, grains)]
@@ -180,9 +193,10 @@ def pictures(
         scene = together(*seen) if len(seen) > 1 else seen[0]
         dust = Grains(*(jnp.concatenate(part) for part in zip(*flying, strict=True))) if flying else None
         # A grain stands for so much soil that it is wider than its streak is long.
-        return picture(terrain, position, turn, optics, light, scene, dust=dust, smear=1, **more)
+        seen_ground = more if pressed is None else more | {"paint": rutted(pressed, more.get("paint"))}
+        return picture(terrain, position, turn, optics, light, scene, dust=dust, smear=1, **seen_ground)
 
-    return in_parts(one, (qpos, qvel, others, others_qvel), at_once)
+    return in_parts(one, (qpos, qvel, others, others_qvel, ruts), at_once)
 
 
 def stereo(mount: Pose, baseline: float) -> tuple[Pose, Pose]:
@@ -229,9 +243,26 @@ def trodden(tracks: Sequence[Track], low: Any, side: float, rows: int | None = N
     return painted(1.0 + fade * (shown - 1.0), low, side)
 
 
-def _brightness(
-    light: Light, label: Any, face: Any, to_eye: Any, to_sun: Any, lit: Any, point: Any, paint: HeightField | None
-) -> Any:
+def rutted(ruts: Ruts, under: HeightField | None = None) -> Callable[[Any, Any], Any]:
+    """Brightness of ground that wheels have pressed, as `paint` of `picture`: tracks without a list of places.
+
+    Args:
+      ruts: what wheels did to the ground. under: paint of the ground that they lie on.
+
+    Returns:
+      A function of x and y, m, of any shape: brightness over that of plain soil, of that shape.
+    """
+
+    def shade(x: Any, y: Any) -> Any:
+        _, pressed = ruts.at(x, y)
+        # The root of the light is what a screen shows.
+        dark = (1.0 - (SOIL_TEXTURE.rut / 255.0) ** Film().gamma) * jnp.clip(pressed / BATCH_VIEW.rut, 0.0, 1.0)
+        return (1.0 - dark) * (1.0 if under is None else sample(under, x, y)[0])
+
+    return shade
+
+
+def _brightness(light: Light, label: Any, face: Any, to_eye: Any, to_sun: Any, lit: Any, point: Any, paint: Any) -> Any:
     """I/F of what is seen, (..., 1), before its colour."""
     soil = light.soil
     earth = np.asarray(light.earth, float) / np.linalg.norm(light.earth)
@@ -252,7 +283,8 @@ def _brightness(
     diffuse = jnp.where(label == ROVER, 1.0, soil.radiance_factor(0.5, 1.0, 0.5) / 0.5)
     bright = direct + thrown * diffuse
     if paint is not None:
-        value, _, _ = sample(paint, point[..., 0], point[..., 1])
+        x, y = point[..., 0], point[..., 1]
+        value = paint(x, y) if callable(paint) else sample(paint, x, y)[0]
         bright = bright * jnp.where(label == GROUND, value, 1.0)
     return bright[..., None]
 

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from lunar_mjx.cameras import Pinhole, front_mount, pictures
+from lunar_mjx.cameras.texture import SOIL_TEXTURE
 from lunar_mjx.dynamics import build
+from lunar_mjx.effects.soil.ruts import tile_of
 from lunar_mjx.envs import make_navigation, split_keys
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
@@ -101,6 +103,8 @@ def test_depth_and_labels_need_no_light() -> None:
         ({"camera_pitch_deg": 91.0}, ("camera_pitch_deg", "-90 to 90")),
         ({"sun_elevation_deg": 120.0}, ("elevation", "120")),
         ({"observations": ("camera/infrared",)}, ("camera/infrared", "camera/rgb")),
+        ({"camera_tracks": True}, ("camera_tracks", "effect ruts", "leave it out")),
+        ({"camera_dust": 1}, ("camera_dust", "neither true nor false")),
     ],
 )
 def test_nonsense_is_refused(options: dict, words: tuple[str, ...]) -> None:
@@ -136,3 +140,38 @@ def test_wheels_that_spin_throw_dust_into_colour_alone() -> None:
     colours = 3 * 16 * 12
     assert np.abs(seen[0] - seen[1])[:colours].max() > 0.02
     np.testing.assert_allclose(seen[0][colours:], seen[1][colours:], rtol=1e-5)
+
+
+def test_soil_that_wheels_pressed_is_darker_in_colour_alone() -> None:
+    """A rover before and after all of its patch was pressed, by a camera that looks steeply down."""
+    blocks = ("goal_body", "camera/rgb", "camera/depth", "camera/labels")
+    options = {"camera_pitch_deg": 75.0, "camera_fovy_deg": 20.0, "camera_tracks": True}
+    env = make_navigation(
+        "consistent",
+        model=make_model("luvmi_x", "flat", preset="consistent").add("rim_contact").add("ruts"),
+        decimation=1,
+        places=8,
+        observations=blocks,
+        **SIZE,
+        **options,
+    )
+    state = jax.jit(env.reset)(env.params, split_keys(jax.random.PRNGKey(0), 1))
+    inner = state.inner
+    kept = inner.physics.effects["ruts"]
+    x, y = (float(v) for v in inner.physics.qpos[0, :2])
+    cell = float(env.params.system.effects["ruts"]["cell"]) * np.mean([w.width for w in env.model.rover.wheels])
+    middle = [jnp.asarray([v / cell]) for v in (x, y)]
+    pressed = {"moved": kept["moved"], "pressed": jnp.full_like(kept["pressed"], 0.01), "tile": tile_of(*middle)}
+    effects = {**inner.physics.effects, "ruts": pressed}
+    trodden = dataclasses.replace(inner, physics=dataclasses.replace(inner.physics, effects=effects))
+    look = jax.jit(lambda p, i: env._observe(p, i, env._view(p, i))[0])
+    before, after = (np.asarray(look(env.params, i)[0, 4:]) for i in (inner, trodden))
+    pixels = 16 * 12
+    np.testing.assert_array_equal(after[3 * pixels :], before[3 * pixels :])
+    colours = [seen[: 3 * pixels].reshape(pixels, 3) for seen in (before, after)]
+    ground = (before[4 * pixels :] == 1) & (colours[0].min(axis=-1) > 0.05)
+    assert ground.mean() > 0.3
+    # as dark as OpenGL's tracks, and nothing else is any darker
+    share = colours[1][ground] / colours[0][ground]
+    assert np.median(share) == pytest.approx(SOIL_TEXTURE.rut / 255.0, rel=0.01)
+    np.testing.assert_array_equal(colours[1][before[4 * pixels :] != 1], colours[0][before[4 * pixels :] != 1])

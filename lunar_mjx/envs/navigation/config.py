@@ -58,6 +58,7 @@ class NavigationConfig:
       camera_fovy_deg: vertical angle of view. camera_pitch_deg: how far the camera looks down. camera_far: how far it
         looks, m. camera_lens: its distortion, `D` of a ROS CameraInfo: k1, k2, p1, p2, k3; none if empty.
       camera_dust: whether camera/rgb shows the soil that wheels throw up; there is none on hard ground or in air.
+      camera_tracks: whether camera/rgb shows pressed soil darker; needs a model with the effect `ruts`.
       sun_azimuth_deg, sun_elevation_deg: where the Sun stands, clockwise from north (y).
       divergence: what follows a state that is not finite: "stop" lets it through, so that a trainer's guard stops and
         dumps it; "reset" ends the episode as failed and counts it in the metric `diverged`, and so a rover that is
@@ -109,6 +110,7 @@ class NavigationConfig:
     camera_far: float = 60.0
     camera_lens: tuple[float, ...] = ()
     camera_dust: bool = False
+    camera_tracks: bool = False
     sun_azimuth_deg: float = 135.0
     sun_elevation_deg: float = 15.0
     delay: float = 0.0
@@ -201,7 +203,7 @@ def _check(c: NavigationConfig) -> None:
         raise bad_input("navigation", "camera_pitch_deg", c.camera_pitch_deg, "is no pitch", "give -90 to 90")
     # the optics and the light refuse values that make no sense, in words of their own
     _ = c.camera, c.sun
-    for name in ("tally", "four_wheel_steering", "posterior", "renew"):
+    for name in ("tally", "four_wheel_steering", "posterior", "renew", "camera_dust", "camera_tracks"):
         if not isinstance(getattr(c, name), bool):
             raise bad_input("navigation", name, getattr(c, name), "is neither true nor false", "give one of them")
     if not isinstance(c.kalman, KalmanConfig):

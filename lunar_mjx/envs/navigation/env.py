@@ -19,6 +19,7 @@ from lunar_mjx.dynamics import Params, System, build
 from lunar_mjx.dynamics import State as Physics
 from lunar_mjx.effects.power.supply import charge_of
 from lunar_mjx.effects.presets import DEFAULT_PRESET
+from lunar_mjx.effects.soil.ruts import Relief
 from lunar_mjx.envs.core import State, side_by_side, split_keys, where
 from lunar_mjx.envs.ladder import chart
 from lunar_mjx.envs.ladder.pool import Pool, make_pool, way_left
@@ -203,6 +204,9 @@ class NavigationEnv:
     def __init__(self, model: Model, config: NavigationConfig, engine: str = "auto"):
         # Before anything is compiled.
         randomise.check_ranges(model, config.randomise)
+        if config.camera_tracks and "ruts" not in model.effect_names:
+            remedy = 'make the model with model.add("rim_contact").add("ruts"), or leave it out'
+            raise bad_input("navigation", "camera_tracks", True, "needs a model with the effect ruts", remedy)
         if config.posterior:
             told = randomise.spread_of(model).parameters
             config = config.replace(randomise=tuple(r for r in config.randomise if r.parameter not in told))
@@ -864,8 +868,17 @@ class NavigationEnv:
                 lit=colour,
                 qvel=inner.physics.qvel if dusty else None,
                 gravity=self.model.gravity,
+                ruts=self._ruts(params, inner) if colour and c.camera_tracks else None,
             )
         return Scene(terrain, inner.drawn, self._ride, self._scale, params.system.sun, seen, c.camera_far, c.mast)
+
+    def _ruts(self, params: NavigationParams, inner: Inner) -> Relief:
+        """What each rover's wheels did to the ground of its patch."""
+        system, _ = randomise.apply(params.system, inner.drawn)
+        width = np.mean([w.width for w in self.model.rover.wheels])
+        kept = inner.physics.effects["ruts"]
+        cell = jnp.broadcast_to(width * system.effects["ruts"]["cell"], kept["moved"].shape[:1])
+        return Relief(kept["moved"], kept["pressed"], kept["tile"], cell)
 
     def _info(self, view: View) -> dict[str, Any]:
         return {
