@@ -240,7 +240,8 @@ def trodden(tracks: Sequence[Track], low: Any, side: float, rows: int | None = N
     at = np.linspace(0.0, 1.0, texels, dtype=np.float32)
     inner = np.clip(np.minimum(at, 1.0 - at) / BATCH_VIEW.edge, 0.0, 1.0)
     fade = np.minimum(inner[:, None], inner[None, :])  # beyond the paint its border's shade would go on as stripes
-    return painted(1.0 + fade * (shown - 1.0), low, side)
+    # The painter shades what a screen shows, which is the root of the light.
+    return painted(1.0 + fade * (shown ** Film().gamma - 1.0), low, side)
 
 
 def rutted(ruts: Ruts, under: HeightField | None = None) -> Callable[[Any, Any], Any]:

@@ -111,9 +111,12 @@ def test_tracks_lie_at_the_same_place_in_both(opengl: tuple[str, ...]) -> None:
             pictures.append(camera.picture(pose).astype(float)[..., 0])
         paint = trodden(shown, np.array([-10.0, -9.0]), 20.0)
         pictures.append(in_jax(ground, pose, sun, paint=paint).rgb[..., 0])
-    drawn, found = pictures[0] / pictures[2] < 0.92, pictures[1] / pictures[3] < 0.95
+    in_gl, in_jax_ = pictures[0] / pictures[2], pictures[1] / pictures[3]
+    drawn, found = in_gl < 0.92, in_jax_ < 0.92
     assert drawn.mean() > 0.1
     assert (drawn == found).mean() > 0.96
+    # and they are as dark
+    assert np.median(in_jax_[drawn & found]) == pytest.approx(np.median(in_gl[drawn & found]), rel=0.03)
 
 
 def test_tracks_that_grow_are_those_known_beforehand(allowed: None) -> None:
