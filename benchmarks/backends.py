@@ -41,7 +41,19 @@ from lunar_mjx.backends import NativeBackend
 from lunar_mjx.dynamics import build
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import Model, make_model
-from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, ORANGE, PAPER, PURPLE, SKY, VERMILION, styled
+from lunar_mjx.report.style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PAPER,
+    PURPLE,
+    SKY,
+    VERMILION,
+    save_light_and_dark,
+    styled,
+)
 
 ENGINES = ("pybullet", "native", "structured", "mjx", "bare", "spheres")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -258,7 +270,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         axes.set_title(rover)
         axes.set_xlabel("rovers at once")
     panels[0].set_ylabel("rover-steps per second")
-    figure.savefig(path, dpi=120)
+    save_light_and_dark(figure, path, dpi=120)
 
 
 _LABELS, _RIGHT = 3e5, 3e8

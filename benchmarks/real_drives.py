@@ -617,7 +617,7 @@ def picture(runs: Sequence[Path], file: Path) -> None:
     """
     from matplotlib.figure import Figure
 
-    from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, styled
+    from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, save_light_and_dark, styled
 
     stored = []
     for run in runs[:2]:
@@ -649,7 +649,7 @@ def picture(runs: Sequence[Path], file: Path) -> None:
             if k == 0:
                 axes.legend(frameon=False, ncols=4, fontsize=8)
         figure.supxlabel("samples of held-out windows, one after another, with a gap between them", fontsize=9)
-        figure.savefig(file, dpi=110)
+        save_light_and_dark(figure, file, dpi=110)
 
 
 def run_all(args: argparse.Namespace) -> None:

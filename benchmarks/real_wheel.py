@@ -111,7 +111,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
     matplotlib.use("svg")
     import matplotlib.pyplot as plt
 
-    from lunar_mjx.report.style import LINES, MUTED, styled
+    from lunar_mjx.report.style import LINES, MUTED, save_light_and_dark, styled
 
     steps = [*rows, {"model": "the same, with the discrepancy as learnt", **rows[-1].get("corrected", rows[-1])}]
     with styled():
@@ -131,7 +131,7 @@ def draw(rows: list[dict[str, Any]]) -> None:
         ax.set_yticks(range(len(steps)), [textwrap.fill(s["model"], 42) for s in steps])
         ax.set_ylim(len(steps) - 0.6, -0.6)
         fig.legend(loc="outside upper right", ncols=3)
-        fig.savefig(FIGURE, metadata={"Date": None})
+        save_light_and_dark(fig, FIGURE, metadata={"Date": None})
         plt.close(fig)
 
 

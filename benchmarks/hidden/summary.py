@@ -196,7 +196,7 @@ def plot(counts: Mapping[str, Sequence[int]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from lunar_mjx.report.style import BLUE, PAPER, SKY, VERMILION, styled
+    from lunar_mjx.report.style import BLUE, PAPER, SKY, VERMILION, save_light_and_dark, styled
 
     shares = np.array([np.array(c) / sum(c) for c in counts.values()])
     kinds = (
@@ -219,7 +219,7 @@ def plot(counts: Mapping[str, Sequence[int]], path: Path) -> None:
         axes.grid(axis="y", visible=False)
         axes.set_xlabel("share of the cases, %")
         figure.legend(loc="outside upper left", ncols=3)
-        figure.savefig(path, dpi=150)
+        save_light_and_dark(figure, path, dpi=150)
         plt.close(figure)
 
 

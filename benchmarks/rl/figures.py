@@ -16,7 +16,7 @@ from harness import KEPT, ROOT, read, say
 
 from lunar_mjx.agents.curves import draw_mean, moving_mean, new_figure, plot_progress
 from lunar_mjx.agents.evaluate import pooled, success_text
-from lunar_mjx.report.style import LINES, LIT, MUTED, styled
+from lunar_mjx.report.style import LINES, LIT, MUTED, save_light_and_dark, styled
 
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
 """Variants of the paper's task that the figure shows; the table has all."""
@@ -183,9 +183,9 @@ def main() -> None:
         say("\n".join(scores(record, name)))
         to = args.out / f"{FILES.get(name, f'rl_{name}')}.png"
         if name in PLOTS:
-            PLOTS[name](record).savefig(to, dpi=110 if name == "paper" else 120)
+            save_light_and_dark(PLOTS[name](record), to, dpi=110 if name == "paper" else 120)
         elif name.startswith("large_") and record["rover"] in name:
-            plot_progress(record["seeds"], to)
+            plot_progress(record["seeds"], to, dark=True)
 
 
 if __name__ == "__main__":

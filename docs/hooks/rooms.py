@@ -53,6 +53,12 @@ WORDS: Mapping[str, str] = {
     "visual": "plots and videos",
     "wheel_bed": "the single-wheel test bed",
 }
+DARK = (
+    '<style>@media (prefers-color-scheme: dark) { text { fill: #e6edf3 } [fill="#fff"] { fill: #0d1117 } '
+    '[fill="#eaf2f8"] { fill: #15202b } [fill="#f4f4f4"] { fill: #161d25 } [stroke="#0072b2"] { stroke: #56b4e9 } }'
+    "</style>"
+)
+"""Colours on a dark page, which a browser asks a picture for as it asks a page."""
 COLUMN: Mapping[str, float] = {
     "commands": 2,
     "demo": 4,
@@ -136,6 +142,7 @@ def draw() -> str:
     out = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {bottom + 60}" font-family="sans-serif" '
         'font-size="11">',
+        DARK,
         '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path d="M0 0L8 4L0 8z" fill="#888"/></marker></defs>',
         f'<rect width="{WIDTH}" height="{bottom + 60}" fill="#fff"/>',

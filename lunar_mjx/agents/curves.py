@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lunar_mjx.files import replacing
-from lunar_mjx.report.style import MUTED, styled
+from lunar_mjx.report.style import MUTED, save_light_and_dark, styled
 
 EPISODES = 20
 """Episodes in the moving mean of curves by episode."""
@@ -47,8 +47,11 @@ def mean_interval(curves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return mean, mean - half, mean + half
 
 
-def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str = "") -> Path:
-    """Return and success over environment steps, and success on unseen ground over wall time; a line per record."""
+def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str = "", dark: bool = False) -> Path:
+    """Return and success over environment steps, and success on unseen ground over wall time; a line per record.
+
+    With `dark` it is written as `NAME_dark.png`, too, for dark pages. Returns `path`.
+    """
     figure, (first, second, third) = new_figure(3)
     for record in records:
         rows = [r for r in record["rows"] if r.get("episode_return") is not None]
@@ -63,6 +66,9 @@ def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str =
     third.set(xlabel="wall time of training, s", ylabel="success on unseen ground, %", ylim=(-3, 103))
     third.axhline(95, color=MUTED, lw=0.8, ls="--")
     first.legend(frameon=False, fontsize=8)
+    if dark:
+        save_light_and_dark(figure, path, dpi=120)
+        return path
     with replacing(path) as part:
         figure.savefig(part, dpi=120)
     return path

@@ -25,6 +25,7 @@ RunArgument = Annotated[Path, typer.Argument(help="Folder that `simulate` wrote.
 def plot(
     run: RunArgument,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Picture; RUN/summary.png if left out.")] = None,
+    dark: Annotated[bool, typer.Option(help="Also as NAME_dark, for dark pages.")] = False,
 ) -> None:
     """Plot a drive: path on shaded relief, slope, slip, sinkage, temperature and power over time."""
     path = out or run / "summary.png"
@@ -33,7 +34,8 @@ def plot(
     from lunar_mjx.visual.plots import drive_summary, save
     from lunar_mjx.visual.recorded import read_drive
 
-    print(save(drive_summary(read_drive(run)), path))
+    for file in save(drive_summary(read_drive(run)), path, dark):
+        print(file)
 
 
 def preview(
@@ -49,7 +51,8 @@ def preview(
     from lunar_mjx.commands.options import open_terrain
     from lunar_mjx.visual.plots import save, terrain_preview
 
-    print(save(terrain_preview(jax.device_get(open_terrain(spec, dem, seed))), out))
+    for file in save(terrain_preview(jax.device_get(open_terrain(spec, dem, seed))), out):
+        print(file)
 
 
 def render(

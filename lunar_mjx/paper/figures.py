@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from lunar_mjx.effects.presets import UNSAID
 from lunar_mjx.files import replacing, write_text
 from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
-from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, darkened, styled
+from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, save_light_and_dark, styled
 
 PRESET_NAMES = ("paper", "consistent")
 SLOPES_DEG = (0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5, 25.0)
@@ -39,15 +39,12 @@ def make_figures(names: Sequence[str], out: Path, trainings: Sequence[Path] = ()
             # Titles and legends of several panels would else run into each other.
             figure.set_layout_engine("constrained")
             FigureCanvasAgg(figure)
-            with replacing(image) as part:
-                figure.savefig(part, dpi=120)
-            written.append(image)
             if dark:
-                written.append(out / f"{_FILES[name]}_dark.png")
-                # One figure in other colours, so that both pages show the same run.
-                darkened(figure)
-                with replacing(written[-1]) as part:
-                    figure.savefig(part, dpi=120, facecolor=figure.get_facecolor())
+                written += save_light_and_dark(figure, image, dpi=120)
+            else:
+                with replacing(image) as part:
+                    figure.savefig(part, dpi=120)
+                written.append(image)
         write_text(data, json.dumps(numbers, indent=1))
         written.append(data)
     return written

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import plotly.graph_objects as go
+
+from lunar_mjx.files import replacing
 
 INK, MUTED, RULE, PAPER = "#1b1f24", "#57606a", "#d0d7de", "#ffffff"
 DARK = {INK: "#e6edf3", MUTED: "#9aa4ae", RULE: "#39414a", PAPER: "#0d1117"}
@@ -132,6 +135,27 @@ def darkened(figure: Any) -> Any:
                 # Lines take one colour alone, collections a list of them.
                 put(new if len(new) > 1 else new[0])
     return figure
+
+
+def save_light_and_dark(figure: Any, path: str | Path, **options: Any) -> list[Path]:
+    """Writes a Matplotlib figure as `NAME.png` and, in the colours of a dark page, as `NAME_dark.png`.
+
+    Args:
+      figure: which is dark thereafter. path: of the light picture; its ending tells the format.
+      options: of `Figure.savefig`, such as `dpi`.
+
+    Returns:
+      Both paths, the light one first.
+    """
+    light = Path(path)
+    dark = light.with_name(f"{light.stem}_dark{light.suffix}")
+    with replacing(light) as part:
+        figure.savefig(part, **options)
+    # One figure in other colours, so that both pages show the same numbers.
+    darkened(figure)
+    with replacing(dark) as part:
+        figure.savefig(part, facecolor=figure.get_facecolor(), **options)
+    return [light, dark]
 
 
 def faded(colour: str, alpha: float) -> str:

@@ -29,6 +29,7 @@ from lunar_mjx.report.style import (
     RULE,
     SHADOW,
     VERMILION,
+    save_light_and_dark,
     styled,
 )
 from lunar_mjx.terrain import Terrain, surface
@@ -79,13 +80,15 @@ def style(axes: Axes, y: str, x: str = "") -> None:
     axes.set_xlabel(x)
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Writes a figure as PNG, SVG or PDF."""
+def save(figure: Figure, path: Path, dark: bool = False) -> list[Path]:
+    """Writes a figure as PNG, SVG or PDF, with `dark` also as `NAME_dark`; returns the files written."""
     FigureCanvasAgg(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if dark:
+        return save_light_and_dark(figure, path, dpi=120)
     with replacing(path) as part:
         figure.savefig(part, dpi=120)
-    return path
+    return [path]
 
 
 def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray, contours: bool = True) -> None:

@@ -19,6 +19,7 @@ def prose(text: str) -> list[str]:
     text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)
+    text = re.sub(r"<picture>.*?</picture>", "", text, flags=re.DOTALL)
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
     blocks: list[list[str]] = [[]]
     for line in text.splitlines():
@@ -86,3 +87,51 @@ def test_every_picture_is_there_and_none_lies_about() -> None:
     assert [p for p in shown if not p.is_file()] == []
     kept = {p for p in (ROOT / "docs" / "figures").iterdir() if p.suffix in (".png", ".svg", ".gif")}
     assert kept - shown == set()
+
+
+LIGHT_ALONE = frozenset(
+    {
+        # pictures of the Moon, which is dark by itself
+        "view_web.png",
+        # a film that is light, of the README's own runs
+        "error_falls.gif",
+        # of runs that no record keeps
+        "drive_summary.png",
+        "real_cuadriga.png",
+        "real_poses.png",
+        "real_snow.png",
+        # SVG that holds both
+        "rooms.svg",
+        # that wait for `lunar-mjx figures --dark`, the last ones for `python -m benchmarks.figures`
+        "fig2_workflow.png",
+        "fig3_motor_heat.png",
+        "fig4_rovers_and_terrain.png",
+        "fig5_soft_ground.png",
+        "fig6_training.png",
+        "slope_stall.png",
+        "backends.png",
+        "hidden_effects.png",
+        "real_wheel.svg",
+        "rl_large_luvmi_x.png",
+        "rl_learners.png",
+        "rl_paper.png",
+        "rl_rates.png",
+        "rl_realism.png",
+    }
+)
+"""Pictures of `docs/figures` without one for dark pages."""
+
+
+def test_figures_follow_the_page_into_the_dark() -> None:
+    folder = ROOT / "docs" / "figures"
+    names = {p.name for p in folder.iterdir() if p.suffix in (".png", ".svg", ".gif")}
+    light = {name for name in names if "_dark." not in name}
+    without = {name for name in light if str(Path(name).with_stem(f"{Path(name).stem}_dark")) not in names}
+    assert without == LIGHT_ALONE
+    for page in PAGES:
+        for name in light - without:
+            shown = re.findall(rf"[(\"](?:[\w/.]*/)?{re.escape(name)}[)\"]", page.read_text(encoding="utf-8"))
+            dark = str(Path(name).with_stem(f"{Path(name).stem}_dark"))
+            assert len(shown) == len(re.findall(rf'srcset="[^"]*{re.escape(dark)}"', page.read_text("utf-8"))), page
+    for drawn in (folder / "rooms.svg", ROOT / "docs" / "structured_engine.svg"):
+        assert "prefers-color-scheme: dark" in drawn.read_text(encoding="utf-8")

@@ -102,6 +102,22 @@ def test_a_dark_page_has_no_light_paper() -> None:
     assert not axes.spines["top"].get_visible()
 
 
+def test_a_figure_is_written_for_light_and_for_dark_pages(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    with styled():
+        figure = Figure(figsize=(1.0, 1.0))
+        figure.subplots().plot([0, 1], [0, 1], color=style.INK)
+        files = style.save_light_and_dark(figure, tmp_path / "line.png", dpi=50)
+    assert [f.name for f in files] == ["line.png", "line_dark.png"]
+    light, dark = (np.asarray(Image.open(f).convert("RGB"), int) for f in files)
+    for shown, paper in ((light, style.PAPER), (dark, style.DARK[style.PAPER])):
+        assert shown[0, 0].tolist() == [int(paper[i : i + 2], 16) for i in (1, 3, 5)]
+    # the same lines, bright where they were dark
+    assert light.min() < 60 and dark.max() > 200 and light.shape == dark.shape
+
+
 def test_a_figure_is_darkened_by_the_table_that_pages_use() -> None:
     from matplotlib.colors import to_hex
     from matplotlib.figure import Figure

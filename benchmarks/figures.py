@@ -1,0 +1,54 @@
+"""Draws the figures of the docs that stand on kept records, each for light and for dark pages.
+
+`python -m benchmarks.figures` draws all of them, `python -m benchmarks.figures backends real_wheel` some. The seed
+paper's figures come from `lunar-mjx figures --dark`, those of a drive from `lunar-mjx plot --dark`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks import backends, real_wheel
+from benchmarks.hidden import summary
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORDS, FIGURES = ROOT / "benchmarks", ROOT / "docs" / "figures"
+LEARNING = ("large_luvmi_x", "rates", "realism", "brax", "paper")
+
+
+def _read(name: str) -> Any:
+    return json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def _learning(name: str) -> Callable[[], Any]:
+    script = RECORDS / "rl" / "figures.py"  # which imports what lies beside it
+    command = [sys.executable, str(script), str(RECORDS / "rl" / f"{name}.json"), "--out", str(FIGURES)]
+    return lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+DRAWN: Mapping[str, Callable[[], Any]] = {
+    "backends": lambda: backends.plot(_read("backends_h200")["rows"], FIGURES / "backends.png"),
+    "hidden_effects": lambda: summary.plot(_read("hidden_effects")["answers"], FIGURES / "hidden_effects.png"),
+    "real_wheel": lambda: real_wheel.draw(_read("real_wheel")["rows"]),
+    **{f"rl_{name}": _learning(name) for name in LEARNING},
+}
+
+
+def main() -> None:
+    """Draws the named figures, or all."""
+    names = sys.argv[1:] or list(DRAWN)
+    unknown = [name for name in names if name not in DRAWN]
+    if unknown:
+        sys.exit(f"figures: {unknown[0]} does not exist; use some of {', '.join(DRAWN)}")
+    for name in names:
+        DRAWN[name]()
+        print(name, flush=True)
+
+
+if __name__ == "__main__":
+    main()
