@@ -13,16 +13,33 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import backends, real_wheel
-from benchmarks.hidden import summary
-
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS, FIGURES = ROOT / "benchmarks", ROOT / "docs" / "figures"
+sys.path.insert(0, str(RECORDS))  # scripts import what lies beside them
+
 LEARNING = ("large_luvmi_x", "rates", "realism", "brax", "paper")
 
 
 def _read(name: str) -> Any:
     return json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def _backends() -> None:
+    from benchmarks import backends
+
+    backends.plot(_read("backends_h200")["rows"], FIGURES / "backends.png")
+
+
+def _hidden_effects() -> None:
+    from benchmarks.hidden import summary
+
+    summary.plot(_read("hidden_effects")["answers"], FIGURES / "hidden_effects.png")
+
+
+def _real_wheel() -> None:
+    from benchmarks import real_wheel
+
+    real_wheel.draw(_read("real_wheel")["rows"])
 
 
 def _learning(name: str) -> Callable[[], Any]:
@@ -32,9 +49,9 @@ def _learning(name: str) -> Callable[[], Any]:
 
 
 DRAWN: Mapping[str, Callable[[], Any]] = {
-    "backends": lambda: backends.plot(_read("backends_h200")["rows"], FIGURES / "backends.png"),
-    "hidden_effects": lambda: summary.plot(_read("hidden_effects")["answers"], FIGURES / "hidden_effects.png"),
-    "real_wheel": lambda: real_wheel.draw(_read("real_wheel")["rows"]),
+    "backends": _backends,
+    "hidden_effects": _hidden_effects,
+    "real_wheel": _real_wheel,
     **{f"rl_{name}": _learning(name) for name in LEARNING},
 }
 

@@ -193,7 +193,7 @@ def pictures(
         scene = together(*seen) if len(seen) > 1 else seen[0]
         dust = Grains(*(jnp.concatenate(part) for part in zip(*flying, strict=True))) if flying else None
         # A grain stands for so much soil that it is wider than its streak is long.
-        seen_ground = more if pressed is None else more | {"paint": rutted(pressed, more.get("paint"))}
+        seen_ground: dict[str, Any] = more if pressed is None else more | {"paint": rutted(pressed, more.get("paint"))}
         return picture(terrain, position, turn, optics, light, scene, dust=dust, smear=1, **seen_ground)
 
     return in_parts(one, (qpos, qvel, others, others_qvel, ruts), at_once)
@@ -285,7 +285,7 @@ def _brightness(light: Light, label: Any, face: Any, to_eye: Any, to_sun: Any, l
     bright = direct + thrown * diffuse
     if paint is not None:
         x, y = point[..., 0], point[..., 1]
-        value = paint(x, y) if callable(paint) else sample(paint, x, y)[0]
+        value: Any = paint(x, y) if callable(paint) else sample(paint, x, y)[0]
         bright = bright * jnp.where(label == GROUND, value, 1.0)
     return bright[..., None]
 

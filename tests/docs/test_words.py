@@ -102,16 +102,13 @@ LIGHT_ALONE = frozenset(
         "real_snow.png",
         # SVG that holds both
         "rooms.svg",
-        # that wait for `lunar-mjx figures --dark`, the last ones for `python -m benchmarks.figures`
+        # that wait for `lunar-mjx figures --dark`; those of learning still have black legends in the dark
         "fig2_workflow.png",
         "fig3_motor_heat.png",
         "fig4_rovers_and_terrain.png",
         "fig5_soft_ground.png",
         "fig6_training.png",
         "slope_stall.png",
-        "backends.png",
-        "hidden_effects.png",
-        "real_wheel.svg",
         "rl_large_luvmi_x.png",
         "rl_learners.png",
         "rl_paper.png",
