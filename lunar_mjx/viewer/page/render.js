@@ -353,7 +353,7 @@ export class Renderer {
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, w, h);
-    gl.clearColor(0, 0, 0, 1);   // the sky: a camera that exposes for sunlit soil sees no stars
+    gl.clearColor(0, 0, 0, 1);   // the sky: a camera that exposes for sunlit soil sees nothing in it
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.depthFunc(gl.LEQUAL);
 
