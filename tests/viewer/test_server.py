@@ -147,7 +147,7 @@ def test_rocks_are_sent_as_far_as_pictures_show_them():
 
 
 def test_the_page_is_told_the_scene_of_the_other_cameras():
-    """The same Sun and rocks as MuJoCo's scene has, and tracks as its painter draws them."""
+    """Sun, rocks and tracks of the page are those of MuJoCo's scene and of the painter of tracks."""
     ground, sun = flat(60.0), Sun(200.0, 8.0)
     centres = np.array([[5.0, 1.0, 0.2], [-8.0, 3.0, 0.1]])
     rocks = build_rocks(centres, np.array([0.5, 0.8]), (-30.0, -30.0, 30.0, 30.0))
