@@ -7,12 +7,12 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pandas as pd
 import tomli_w
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input, one_line, require_file
@@ -76,19 +76,11 @@ class _Hidden(BaseModel):
     parameters: dict[str, Any]
 
 
-class _Answer(BaseModel):
-    """Kinds of an answer's fields; what is hashed is the file's own content, which nothing converts."""
-
-    model_config = ConfigDict(strict=True)
-    log: str
-    nonce: str
-    seed: int
-    preset: str
-    manoeuvre: str
-    scale: float
-    effects: list[_Hidden]
-    recording: dict[str, Any]
-    data_sha256: str
+_KINDS: dict[str, Any] = {**get_type_hints(Answer), "effects": list[_Hidden]}
+_Answer: type[BaseModel] = create_model(
+    "_Answer", __config__=ConfigDict(strict=True), **{name: (kind, ...) for name, kind in _KINDS.items()}
+)
+"""Checks the kinds of an answer's fields; what is hashed is the file's own content, which nothing converts."""
 
 
 def read_answer(path: str | Path) -> Answer:

@@ -29,6 +29,14 @@ def _change(rover: Path, file: str, old: str, new: str) -> None:
     path.write_text(re.sub(old, new, text, count=1))
 
 
+def _refused(rover: Path, file: str, old: str, new: str, said: str) -> None:
+    """Loading is refused by a sentence that names the file, once `new` stands in it for the text `old`."""
+    _change(rover, file, re.escape(old), new)
+    with pytest.raises(UserError, match=re.escape(said)) as error:
+        load_rover(rover)
+    assert str(error.value).startswith(f"{rover / file}: ")
+
+
 IGNORED = {
     "ref": (JOINT, 'ref="0.1"', "ref of the joint 'lf_suspension' would be ignored"),
     "actuatorfrcrange": (
@@ -46,10 +54,7 @@ IGNORED = {
 @pytest.mark.parametrize("field", IGNORED)
 def test_fields_of_joints_and_motors_that_would_be_ignored_are_refused(rover, field):
     element, attribute, said = IGNORED[field]
-    _change(rover, "luvmi_x.xml", element, f"{element} {attribute}")
-    with pytest.raises(UserError, match=re.escape(said)) as error:
-        load_rover(rover)
-    assert str(rover / "luvmi_x.xml") in str(error.value)
+    _refused(rover, "luvmi_x.xml", element, f"{element} {attribute}", said)
 
 
 @pytest.mark.parametrize("kind", ["position", "velocity", 'general gainprm="2"', 'general dyntype="integrator"'])
@@ -96,11 +101,7 @@ NUMBERS = {
 @pytest.mark.parametrize("field", NUMBERS)
 def test_numbers_that_no_mechanism_has_are_refused(rover, field, monkeypatch):
     monkeypatch.chdir(rover)  # where MuJoCo writes of its warnings
-    old, new, said = NUMBERS[field]
-    _change(rover, "luvmi_x.xml", re.escape(old), new)
-    with pytest.raises(UserError, match=re.escape(said)) as error:
-        load_rover(rover)
-    assert str(rover / "luvmi_x.xml") in str(error.value)
+    _refused(rover, "luvmi_x.xml", *NUMBERS[field])
 
 
 FLEET = 'loops = []\ndrive_groups = [{name = "left", joints = [%s]}]'
@@ -145,11 +146,7 @@ DESCRIBED = {
 
 @pytest.mark.parametrize("field", DESCRIBED)
 def test_a_description_that_its_mjcf_contradicts_is_refused(rover, field):
-    old, new, said = DESCRIBED[field]
-    _change(rover, "rover.toml", re.escape(old), new)
-    with pytest.raises(UserError, match=re.escape(said)) as error:
-        load_rover(rover)
-    assert str(error.value).startswith(f"{rover / 'rover.toml'}: ")
+    _refused(rover, "rover.toml", *DESCRIBED[field])
 
 
 @pytest.mark.parametrize("step", ["0", "-1", "10"])
