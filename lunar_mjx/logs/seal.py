@@ -76,10 +76,9 @@ class _Hidden(BaseModel):
     parameters: dict[str, Any]
 
 
-_KINDS: dict[str, Any] = {**get_type_hints(Answer), "effects": list[_Hidden]}
-_Answer: type[BaseModel] = create_model(
-    "_Answer", __config__=ConfigDict(strict=True), **{name: (kind, ...) for name, kind in _KINDS.items()}
-)
+_KINDS: dict[str, Any] = {name: (kind, ...) for name, kind in get_type_hints(Answer).items()}
+_KINDS |= {"effects": (list[_Hidden], ...)}
+_Answer: type[BaseModel] = create_model("_Answer", __config__=ConfigDict(strict=True), **_KINDS)
 """Checks the kinds of an answer's fields; what is hashed is the file's own content, which nothing converts."""
 
 
