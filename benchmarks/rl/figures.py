@@ -16,7 +16,7 @@ from harness import KEPT, ROOT, read, say
 
 from lunar_mjx.agents.curves import draw_mean, moving_mean, new_figure, plot_progress
 from lunar_mjx.agents.evaluate import pooled, success_text
-from lunar_mjx.report.style import LINES, LIT, MUTED, save_light_and_dark, styled
+from lunar_mjx.report.style import INK, LINES, LIT, MUTED, save_light_and_dark, styled
 
 DRAWN = ("signed", "printed", "scaled", "scaled, layer norm, 3 steps", "steady")
 """Variants of the paper's task that the figure shows; the table has all."""
@@ -84,8 +84,7 @@ def plot_paper(record: dict[str, Any]) -> Any:
     figure, above = new_figure(len(groups), 2.7, 5.0)
     for axes in above:
         axes.remove()
-    with styled():
-        rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
+    rows = figure.subplots(2, len(groups), sharex="col", squeeze=False)
     for column, (variant, algorithms) in enumerate(groups.items()):
         for name, runs in algorithms.items():
             colour, line = LINES[int(name == "DDPG")][:2]
@@ -136,7 +135,7 @@ def plot_realism(record: dict[str, Any]) -> Any:
             axes.barh(at, share, left=bottom, height=0.55, hatch=hatch, edgecolor=LIT, label=reason.replace("_", " "))
             bottom += share
     middle, low, high = (100 - np.array(shares(list(cells.values()), k)) for k in ("success", "high", "low"))
-    axes.errorbar(middle, at, xerr=[middle - low, high - middle], fmt="none", ecolor="k", capsize=3, lw=1)
+    axes.errorbar(middle, at, xerr=[middle - low, high - middle], fmt="none", ecolor=INK, capsize=3, lw=1)
     labels = [f"trained {trained},\ntested {tested} the effects" for trained, tested in cells]
     axes.set_yticks(at, labels, fontsize=8)
     axes.invert_yaxis()
@@ -171,6 +170,7 @@ FILES = {"brax": "rl_learners"}
 """Of figures that are not called by the record's name."""
 
 
+@styled()  # legends and titles, too, which would else be black on dark pages
 def main() -> None:
     """Prints what records hold, and draws those that have a figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

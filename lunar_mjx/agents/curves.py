@@ -47,6 +47,7 @@ def mean_interval(curves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return mean, mean - half, mean + half
 
 
+@styled()
 def plot_progress(records: Sequence[Mapping[str, Any]], path: Path, title: str = "", dark: bool = False) -> Path:
     """Return and success over environment steps, and success on unseen ground over wall time; a line per record.
 
@@ -88,6 +89,7 @@ def draw_mean(
         axes.fill_between(at, low, high, alpha=alpha, lw=0, color=drawn.get_color())
 
 
+@styled()
 def plot_episodes(groups: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> Path:
     """Average return per episode over episodes, as the paper's Fig. 6: mean over seeds with its interval.
 

@@ -48,8 +48,10 @@ LINES: tuple[tuple[str, Any], ...] = (
     (SKY, (0, (8, 2, 1, 2, 1, 2))),
 )
 """Colour and line of the first, second, ... line of a plot that names no styles: in grey the line tells them apart."""
-ROCK, SHADOW, LIT = "#3a3a3a", "#000000", "#ffffff"
-"""What is drawn on pictures of the ground: rocks, outlines on bright ground, and marks on dark ground."""
+ROCK, SHADOW, LIT = "#3a3a3a", "#000000", "#fffffe"
+"""What is drawn on pictures of the ground: rocks, outlines on bright ground, and marks on dark ground.
+
+Pictures stay what they are on a dark page, and marks on them too: so white marks are not quite `PAPER`."""
 HEIGHTS, HEIGHTS_DOWN, RELIEF, SHARES = "cividis", "cividis_r", "gray", "Greys"
 """Colour maps: of numbers, which rise in lightness alike for all eyes; of shaded ground; of counts."""
 SHADES = ((0.0, "#f7fbff"), (0.25, "#c6dbef"), (0.5, "#6baed6"), (0.75, "#2171b5"), (1.0, "#08306b"))
@@ -124,14 +126,16 @@ def darkened(figure: Any) -> Any:
 
     swap = {to_hex(light): dark for light, dark in DARK_FIGURES.items()}
     for artist in figure.findobj():
-        mapped = getattr(artist, "get_array", lambda: None)() is not None
-        for name in ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor"):
-            get, put = getattr(artist, f"get_{name}", None), getattr(artist, f"set_{name}", None)
-            if get is None or put is None or mapped:
-                continue
-            found = to_rgba_array(get())
+        if getattr(artist, "get_array", lambda: None)() is not None:
+            continue
+        names = ("color", "facecolor", "edgecolor", "markerfacecolor", "markeredgecolor")
+        getters = {name: getattr(artist, f"get_{name}", None) for name in names}
+        # All are read before one is set: a marker follows its line, and would be swapped twice.
+        colours = {name: to_rgba_array(get()) for name, get in getters.items() if get is not None}
+        for name, found in colours.items():
+            put = getattr(artist, f"set_{name}", None)
             new = [to_rgba(swap[to_hex(c)], c[3]) if to_hex(c) in swap else tuple(c) for c in found]
-            if any(a != tuple(b) for a, b in zip(new, found, strict=True)):
+            if put is not None and any(a != tuple(b) for a, b in zip(new, found, strict=True)):
                 # Lines take one colour alone, collections a list of them.
                 put(new if len(new) > 1 else new[0])
     return figure

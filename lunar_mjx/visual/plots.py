@@ -122,7 +122,7 @@ def draw_relief(axes: Axes, terrain: Terrain, low: np.ndarray, high: np.ndarray,
             transform=axes.transAxes,
             fontsize=8,
             color=LIT,
-            bbox={"facecolor": INK, "alpha": 0.65, "edgecolor": "none", "pad": 2.5},
+            bbox={"facecolor": SHADOW, "alpha": 0.65, "edgecolor": "none", "pad": 2.5},
         )
     stones = [
         Ellipse((x, y), 2.0 * a, 2.0 * b, angle=np.degrees(angle))
@@ -227,7 +227,7 @@ def _draw_path(figure: Figure, axes: Axes, drive: RecordedDrive) -> None:
     slip = np.nanmean(np.abs(drive.per_wheel("wheel_{}_slip_ratio")), axis=1)
     for n, track in enumerate(drive.tracks()):
         axes.plot(
-            *track.places.T, "-", color=SHADOW, linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
+            *track.places.T, "-", color=INK, linewidth=1.0, alpha=0.55, zorder=2, label="wheels" if n == 0 else None
         )
     axes.add_patch(
         Polygon(

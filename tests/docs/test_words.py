@@ -96,24 +96,11 @@ LIGHT_ALONE = frozenset(
         # a film that is light, of the README's own runs
         "error_falls.gif",
         # of runs that no record keeps
-        "drive_summary.png",
         "real_cuadriga.png",
         "real_poses.png",
         "real_snow.png",
         # SVG that holds both
         "rooms.svg",
-        # that wait for `lunar-mjx figures --dark`; those of learning still have black legends in the dark
-        "fig2_workflow.png",
-        "fig3_motor_heat.png",
-        "fig4_rovers_and_terrain.png",
-        "fig5_soft_ground.png",
-        "fig6_training.png",
-        "slope_stall.png",
-        "rl_large_luvmi_x.png",
-        "rl_learners.png",
-        "rl_paper.png",
-        "rl_rates.png",
-        "rl_realism.png",
     }
 )
 """Pictures of `docs/figures` without one for dark pages."""

@@ -128,7 +128,8 @@ def test_a_figure_is_darkened_by_the_table_that_pages_use() -> None:
         figure = Figure()
         axes = figure.subplots()
         (line,) = axes.plot([0, 1], [1, 2], color=style.INK, marker="o", markerfacecolor=style.PAPER)
-        (blue,) = axes.plot([0, 1], [2, 1], color=style.BLUE)
+        (blue,) = axes.plot([0, 1], [2, 1], color=style.BLUE, marker="o")
+        (mark,) = axes.plot([0], [0], "s", color=style.LIT)  # on a picture of the ground, which stays as it is
         band = axes.fill_between([0, 1], [0, 1], color=style.PURPLE, alpha=0.2)
         dots = axes.scatter([0, 1], [0, 1], c=[0.0, 1.0], cmap=style.HEIGHTS)
         title = axes.set_title("title")
@@ -137,7 +138,8 @@ def test_a_figure_is_darkened_by_the_table_that_pages_use() -> None:
         diagram = style.darkened(figure_2()[0])
     assert line.get_color()[:3] == pytest.approx([int(style.DARK[style.INK][i : i + 2], 16) / 255 for i in (1, 3, 5)])
     assert to_hex(line.get_markerfacecolor()) == to_hex(style.DARK[style.PAPER])
-    assert to_hex(blue.get_color()) == to_hex(style.SKY)
+    assert to_hex(blue.get_color()) == to_hex(blue.get_markerfacecolor()) == to_hex(style.SKY)
+    assert to_hex(mark.get_markerfacecolor()) == style.LIT
     assert to_hex(band.get_facecolor()[0]) == to_hex(style.DARK_SERIES[style.PURPLE])
     assert band.get_facecolor()[0][3] == pytest.approx(0.2)
     assert to_hex(title.get_color()) == to_hex(style.DARK[style.INK])
