@@ -26,12 +26,9 @@ from lunar_mjx.cameras.raymarch import in_parts, mounted
 from lunar_mjx.cameras.rays.trace import GROUND, ROCK, ROVER, SKY, sunlit, trace
 from lunar_mjx.cameras.scene import Sun
 from lunar_mjx.cameras.shapes import Placed, bodies, placed, rover_shapes, together
-from lunar_mjx.cameras.texture import ALBEDO, SOIL_TEXTURE, Track, TrackPainter, regolith
+from lunar_mjx.cameras.texture import ALBEDO, SOIL_TEXTURE, TINT, Track, TrackPainter, regolith
 from lunar_mjx.rover import Rover
 from lunar_mjx.terrain import HeightField, Terrain, sample
-
-TINT = ALBEDO / ALBEDO[0]
-"""Colour of regolith, red first."""
 
 
 @dataclasses.dataclass(frozen=True)

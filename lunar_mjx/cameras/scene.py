@@ -25,6 +25,8 @@ from lunar_mjx.terrain import Terrain
 from lunar_mjx.terrain.rocks import semi_axes
 
 GROUND, FAR_GROUND, ROCK, FRONT = "ground", "far_ground", "rock", "front"
+LEVEL_LIGHT = 0.55
+"""Brightness of the Sun's light on level ground, to which `texture.ALBEDO` is fitted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Sun:
     @property
     def exposure(self) -> float:
         """Brightness of the light, by which level ground looks alike down to a Sun 10 deg high, as a camera exposes."""
-        return 0.55 / max(math.sin(math.radians(self.elevation_deg)), 0.17)
+        return LEVEL_LIGHT / max(math.sin(math.radians(self.elevation_deg)), 0.17)
 
 
 @dataclasses.dataclass(frozen=True)

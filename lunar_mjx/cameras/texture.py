@@ -10,8 +10,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 ALBEDO = np.array([0.79, 0.77, 0.744])
-"""Colour of regolith under MuJoCo's light, which is 0.55 on level ground (`Sun.exposure`). So level ground is as bright
+"""Colour of regolith under MuJoCo's light, 0.55 on level ground (`scene.LEVEL_LIGHT`). So level ground is as bright
 on screen as the cameras in JAX expose it: 0.16 ** (1 / 2.2) = 0.435 (`Film`)."""
+TINT = ALBEDO / ALBEDO[0]
+"""Colour of regolith over that of its red."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 
 from lunar_mjx.cameras.chase import print_pitch
 from lunar_mjx.cameras.dust.grains import Grains
-from lunar_mjx.cameras.photometry import Film, Regolith
-from lunar_mjx.cameras.scene import SCENE_DETAIL, Patch, Sun, cut
-from lunar_mjx.cameras.texture import SOIL_TEXTURE
+from lunar_mjx.cameras.photometry import ROCK_BRIGHTNESS, Film, Regolith
+from lunar_mjx.cameras.scene import LEVEL_LIGHT, SCENE_DETAIL, Patch, Sun, cut
+from lunar_mjx.cameras.texture import SOIL_TEXTURE, TINT
 from lunar_mjx.model import Model
 from lunar_mjx.rover.look import LOOK, seen_spec
 from lunar_mjx.terrain import Terrain
@@ -33,6 +33,19 @@ class DrawnGround:
 DRAWN_GROUND = DrawnGround()
 
 
+@dataclasses.dataclass(frozen=True)
+class PageLight:
+    """How the page's lambertian scene is lit: choices. `Film` decides how bright level soil is on the screen."""
+
+    soil: float = 0.6
+    """Reflectance of soil, by which level faces of rovers stand beside it as in MuJoCo's pictures, within a tenth."""
+    thrown: float = 0.075
+    """Share of level soil's light that is no sunlight: what the ground throws back, and shadows keep."""
+
+
+PAGE_LIGHT = PageLight()
+
+
 _SHAPES = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
     mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
@@ -45,7 +58,8 @@ _SHAPES = {
 
 def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
     """The rover's shapes, wheels, and the light, as plain data for JSON."""
-    rover, soil = model.rover, Regolith()
+    rover, soil, film = model.rover, Regolith(), Film()
+    level = film.mid / PAGE_LIGHT.soil
     mj = seen_spec(rover).compile()
     shapes = [
         _shape(mj, i) for i in range(mj.ngeom) if mj.geom_group[i] < LOOK.hidden and int(mj.geom_type[i]) in _SHAPES
@@ -69,9 +83,16 @@ def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
         "tracks": {"rut": SOIL_TEXTURE.rut / 255.0, "print": SOIL_TEXTURE.print / 255.0},
         "size": float(2.0 * np.abs(rover.chassis_points).max()),
         "sun": sun.direction.tolist(),
-        "exposure": sun.exposure,
+        # Level soil comes out at the film's `mid`, as in the other cameras; a Sun below 10 deg is not made up for.
+        "light": {
+            "exposure": (1.0 - PAGE_LIGHT.thrown) * level * sun.exposure / LEVEL_LIGHT,
+            "fill": PAGE_LIGHT.thrown * level,
+            "gamma": film.gamma,
+        },
+        "soil": (PAGE_LIGHT.soil * TINT).tolist(),
+        "rock": (ROCK_BRIGHTNESS * PAGE_LIGHT.soil * TINT).tolist(),
         # How bright flying grains are beside level ground, by the formulas of the other cameras.
-        "cloud": [float(Film().gain(soil, float(sun.direction[2]))) / Film().mid, soil.albedo, soil.lobe, soil.back],
+        "cloud": [float(film.gain(soil, float(sun.direction[2]))) / film.mid, soil.albedo, soil.lobe, soil.back],
     }
 
 

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from lunar_mjx.cameras.chase import tracks_of
-from lunar_mjx.cameras.scene import Sun, build_scene
-from lunar_mjx.cameras.texture import TrackPainter
+from lunar_mjx.cameras.photometry import Film
+from lunar_mjx.cameras.scene import LEVEL_LIGHT, Sun, build_scene
+from lunar_mjx.cameras.texture import TINT, TrackPainter
 from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.terrain import Terrain, build_rocks, flat, sample
@@ -156,7 +157,11 @@ def test_the_page_is_told_the_scene_of_the_other_cameras():
     drawn, _ = build_scene(model.rover, terrain, np.zeros((1, 2)), sun)
     told = rover_scene(model, sun)
     np.testing.assert_allclose(told["sun"], -drawn.light_dir[0], atol=1e-6)
-    assert told["exposure"] == pytest.approx(drawn.light_diffuse[0, 0])
+    # level soil: as bright on the screen as the film of the cameras in JAX has it, and as MuJoCo's light shows it
+    on_page = [c * (told["light"]["exposure"] * told["sun"][2] + told["light"]["fill"]) for c in told["soil"]]
+    lit, film = drawn.light_diffuse[0, 0] / LEVEL_LIGHT * told["sun"][2], Film()
+    np.testing.assert_allclose(on_page, lit * film.mid * TINT, rtol=0.02)
+    assert told["light"]["gamma"] == film.gamma
     balls = [g for g in range(drawn.ngeom) if drawn.geom(g).name.startswith("rock_")]
     sent = np.array(sorted(ground_scene(terrain, 0.0, 0.0)["rocks"]))
     found = np.array(sorted([*drawn.geom_pos[g], drawn.geom_size[g, 0]] for g in balls))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from lunar_mjx.cameras.dust.grains import SPRAY, Grains
 from lunar_mjx.cameras.photometry import Regolith
 from lunar_mjx.cameras.pinhole import Pinhole, Pose, project
-from lunar_mjx.cameras.texture import ALBEDO
+from lunar_mjx.cameras.texture import TINT
 from lunar_mjx.rover.look import LOOK
 
 
@@ -167,7 +167,7 @@ def _through(xp: Any, behind: Any, total: Any, shine: Any, cloud: Any) -> Any:
     """Light (..., 3) with dust of an optical depth before it, of which `shine` is lit; `cloud` as bright as a thick one
     is in red."""
     total, lit = total[..., None], (shine / xp.maximum(total, 1e-9))[..., None]
-    return behind * xp.exp(-total) + (cloud[..., None] * lit * -xp.expm1(-total)) * (ALBEDO / ALBEDO[0])
+    return behind * xp.exp(-total) + (cloud[..., None] * lit * -xp.expm1(-total)) * TINT
 
 
 def _splats(

@@ -5,7 +5,7 @@ import { Renderer } from "./render.js";
 import { Replay } from "./replay.js";
 import { cylinder, ground, pebbles, shapeOf, sphere } from "./shapes.js";
 
-const GROUND = [0.60, 0.585, 0.565], ROCK = GROUND.map((soil) => 1.5 * soil), STILL = pose([0, 0, 0], [1, 0, 0, 0]);
+const STILL = pose([0, 0, 0], [1, 0, 0, 0]);
 const GHOST = [0.34, 0.71, 0.91], GHOSTLY = 0.55, POST = [0.03, 0.7], FLAG = [0.9, 0.62, 0.0];
 const ANGLE = 0.75, FETCH_AGAIN = 7, MOST_BARS = 80000, VIEWS = ["follow", "fixed", "from above"];
 
@@ -18,7 +18,7 @@ async function json(path) {
 class View {
   constructor(scene, canvas) {
     this.scene = scene;
-    this.renderer = new Renderer(canvas, scene.sun, scene.exposure, scene.cloud);
+    this.renderer = new Renderer(canvas, scene.sun, scene.light, scene.cloud);
     this.rover = scene.shapes.filter((s) => s.colour[3] > 0).map((shape) => ({ mesh: this.renderer.upload(shapeOf(shape)),
       body: shape.body, local: pose(shape.place, shape.turn), colour: shape.colour.slice(0, 3),
       kind: shape.kind === "cylinder" && scene.wheels.some((w) => w.body === shape.body) ? 4 : 0 }));
@@ -48,16 +48,16 @@ class View {
       const under = (px, py) => (px > near.low[0] + step && px < near.high[0] - step &&
         py > near.low[1] + step && py < near.high[1] - step ? 3 : 0.05);
       this.soil.forEach((part) => part.mesh !== this.ball && this.renderer.free(part.mesh));
-      this.soil = [{ mesh: this.renderer.upload(fine), model: STILL, colour: GROUND, kind: 1 },
-        { mesh: this.renderer.upload(ground(far, under)), model: STILL, colour: GROUND, kind: 2 }];
+      this.soil = [{ mesh: this.renderer.upload(fine), model: STILL, colour: this.scene.soil, kind: 1 },
+        { mesh: this.renderer.upload(ground(far, under)), model: STILL, colour: this.scene.soil, kind: 2 }];
       const inside = ([cx, cy]) => cx > near.low[0] && cx < near.high[0] && cy > near.low[1] && cy < near.high[1];
       const away = seen.rocks.filter((rock) => !inside(rock));
       // one mesh, or a field of a thousand boulders would take as many calls a picture
-      if (away.length) this.soil.push({ mesh: this.renderer.upload(pebbles(away)), model: STILL, colour: ROCK, kind: 3, far: true });
+      if (away.length) this.soil.push({ mesh: this.renderer.upload(pebbles(away)), model: STILL, colour: this.scene.rock, kind: 3, far: true });
       for (const [cx, cy, cz, ...axes] of seen.rocks.filter(inside)) {
         const columns = [0, 3, 6].flatMap((i) => [...axes.slice(i, i + 3), 0]);
         const model = new Float32Array([...columns, cx, cy, cz, 1]);
-        this.soil.push({ mesh: this.ball, model, colour: ROCK, kind: 3 });
+        this.soil.push({ mesh: this.ball, model, colour: this.scene.rock, kind: 3 });
       }
       this.middle = [x, y];
       this.renderer.clearTracks(this.middle);
@@ -127,7 +127,7 @@ class View {
     });
     const ghost = this.ghost ? standing(this.ghost, { colour: GHOST, kind: 0, alpha: GHOSTLY }) : [];
     this.renderer.draw([...standing(this.bodies), ...this.marks(), ...this.soil], ghost, at.slice(0, 3), eye, clip,
-      { grains: this.dust, colour: GROUND, angle: ANGLE });
+      { grains: this.dust, colour: this.scene.soil, angle: ANGLE });
   }
 
   // Where the rover wants to go: a post with a ball on it.

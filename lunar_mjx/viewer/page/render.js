@@ -13,11 +13,14 @@ const DEPTH_FRAGMENT = `#version 300 es
 precision highp float;
 void main() {}`;
 
-// A filmic shoulder: the brightest parts of the rover keep their shading.
+// From light to the screen as the other cameras' film has it, up to where it would saturate: a shoulder in place of a
+// clip, so that the brightest parts of the rover keep their shading.
 const SHOWN = `
+uniform float gamma;
 vec3 shown(vec3 sum) {
-  vec3 film = sum * (2.51 * 0.62 * sum + 0.03 * 2.0) / (0.62 * sum * (2.43 * 0.62 * sum + 0.59) + 0.14) * 0.62;
-  return pow(clamp(film, 0.0, 1.0), vec3(1.0 / 2.0));
+  const float knee = 0.5;
+  vec3 film = min(sum, knee) + (1.0 - knee) * (1.0 - exp(-max(sum - knee, 0.0) / (1.0 - knee)));
+  return pow(max(film, 0.0), vec3(1.0 / gamma));
 }`;
 
 const VERTEX = `#version 300 es
@@ -47,7 +50,7 @@ in vec3 at, facing, own;
 in vec4 shade;
 in float edgewise;   // 1 on a wheel's flanks, 0 on its rim
 uniform vec3 eye, sun, colour;
-uniform float exposure, span, alpha;
+uniform float exposure, fill, span, alpha;   // of the Sun's light and of what the ground throws back
 uniform vec2 middle;         // of the ground on which tracks are drawn
 uniform int kind;            // 0 rover, 1 near ground, 2 far ground, 3 rock, 4 wheel
 uniform sampler2DShadow shadows;
@@ -121,9 +124,9 @@ void main() {
   }
   float facingSun = max(dot(n, sun), 0.0), light = facingSun > 0.0 ? (kind == 2 ? 1.0 : lit()) : 0.0;  // else the seam would cast one
   float shine = gloss * pow(max(dot(n, normalize(sun + toEye)), 0.0), 40.0);
-  // fill: light thrown back by the ground, so that shadows are dark but not holes
-  float fill = 0.06 + 0.05 * (1.0 - n.z);
-  vec3 sum = base * (exposure * 1.35 * facingSun * light + fill) + vec3(shine * light * exposure);
+  // light thrown back by the ground, so that shadows are dark but not holes
+  float thrown = fill * (1.0 + 0.8 * (1.0 - n.z));
+  vec3 sum = base * (exposure * facingSun * light + thrown) + vec3(0.75 * shine * light * exposure);
   // what is on the screen is darkened, as the other cameras' tracks are
   pixel = vec4(shown(sum) * trodden, alpha);
 }`;
@@ -154,20 +157,21 @@ const DUST_FRAGMENT = `#version 300 es
 precision highp float;
 in float thick, glow;
 uniform vec3 colour, sun;
-uniform float exposure;
+uniform float exposure, fill;
 out vec4 pixel;
 ${SHOWN}
 void main() {
   vec2 at = 6.0 * (gl_PointCoord - 0.5);
   float t = thick * exp(-0.5 * dot(at, at));
-  pixel = vec4(shown(colour * (1.35 * exposure * sun.z * glow + 0.06)), 1.0 - exp(-t));
+  pixel = vec4(shown(colour * (exposure * sun.z * glow + fill)), 1.0 - exp(-t));
 }`;
 
 export class Renderer {
-  constructor(canvas, sun, exposure, cloud) {
+  // light: {exposure, fill, gamma}, see `viewer/scene.py`.
+  constructor(canvas, sun, light, cloud) {
     const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "high-performance", preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2: use a recent Firefox, Chrome, Edge or Safari with graphics acceleration.");
-    Object.assign(this, { gl, canvas, sun, exposure, cloud });
+    Object.assign(this, { gl, canvas, sun, light, cloud });
     this.depth = this.program(DEPTH_VERTEX, DEPTH_FRAGMENT);
     this.surface = this.program(VERTEX, FRAGMENT);
     this.dust = this.program(DUST_VERTEX, DUST_FRAGMENT);
@@ -240,7 +244,7 @@ export class Renderer {
     gl.uniform3fv(at.eye, eye);
     gl.uniform3fv(at.sun, this.sun);
     gl.uniform4fv(at.cloud, this.cloud);
-    gl.uniform1f(at.exposure, this.exposure);
+    this.exposeBy(at);
     gl.uniform3fv(at.colour, colour);
     gl.uniform1f(at.focal, focal);
     gl.uniform1i(at.shadows, 0);
@@ -363,7 +367,7 @@ export class Renderer {
     gl.uniformMatrix4fv(at.light, false, light);
     gl.uniform3fv(at.eye, eye);
     gl.uniform3fv(at.sun, this.sun);
-    gl.uniform1f(at.exposure, this.exposure);
+    this.exposeBy(at);
     gl.uniform1f(at.span, TRACK_SPAN);
     gl.uniform2fv(at.middle, this.middle);
     gl.uniform1f(at.offset, 1.6 * 2 * REACH / SHADOW);
@@ -394,6 +398,10 @@ export class Renderer {
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     each(ghosts);
     gl.disable(gl.BLEND);
+  }
+
+  exposeBy(at) {
+    for (const name of ["exposure", "fill", "gamma"]) this.gl.uniform1f(at[name], this.light[name]);
   }
 
   triangles(mesh) {
