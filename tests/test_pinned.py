@@ -28,3 +28,5 @@ def test_every_pin_has_its_hashes_and_no_other_version():
     text = (ROOT / HASHED).read_text(encoding="utf-8")
     blocks = re.findall(r"^[\w.-]+==[^\n]*((?:\n    --hash=sha256:[0-9a-f]{64}[ \\]*)+)", text, re.MULTILINE)
     assert len(blocks) == len(wanted)
+    hashes = [line for line in text.splitlines() if "--hash" in line]
+    assert all(re.fullmatch(r" {4}--hash=sha256:[0-9a-f]{64}( \\)?", line) for line in hashes)

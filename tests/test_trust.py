@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import shutil
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from lunar_mjx import trust
 from lunar_mjx.agents.play import open_agent
 from lunar_mjx.agents.policy import load_policy, save_policy
+from lunar_mjx.diagnosis.folder.stored import read_arrays
 from lunar_mjx.diagnosis.report import write_report
 from lunar_mjx.diagnosis.runs import FORMAT, RUN_FILE, load_run
 from lunar_mjx.effects import catalogue
@@ -19,6 +21,7 @@ from lunar_mjx.errors import UserError
 from lunar_mjx.model import make_model
 from lunar_mjx.model.file import load_model, save_model
 from lunar_mjx.resources import shipped
+from lunar_mjx.terrain import load_terrain
 
 REFUSED = r"is Python code that would run on this machine; read .*mine\.py, and if you know whose it is add --trust"
 
@@ -156,3 +159,36 @@ def test_arrays_with_pickles_run_nothing(name, tmp_path):
     with pytest.raises(UserError, match="is no policy"):
         load_policy(path)
     assert not mark.exists()
+
+
+READERS = {
+    "arrays of a run": read_arrays,
+    "a map of soils": lambda path: load_terrain({"surface": SURFACE, "soil": {"grids": {"file": str(path)}}}),
+}
+SURFACE = {"width": 4.0, "height": 4.0, "cell": 0.5}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_archives_with_pickles_run_nothing(name, tmp_path):
+    path, mark = tmp_path / "received.npz", tmp_path / "it ran"
+    np.savez(path, k_phi=np.array([[_Mark(mark)]], dtype=object), cell=np.array(1.0))
+    with pytest.raises(UserError, match="pickle"):
+        READERS[name](path)
+    assert not mark.exists()
+
+
+UNPICKLES = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal", "torch"}
+"""Modules that run code of whoever wrote what they read."""
+
+
+def test_no_reader_of_the_package_takes_pickles():
+    """By the source, so that a reader that is added later is held to it, too."""
+    package, found = Path(trust.__file__).parent, []
+    for path in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = {a.name for a in node.names} if isinstance(node, ast.Import) else set()
+            names |= {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
+            taken = isinstance(node, ast.keyword) and node.arg == "allow_pickle"
+            if (taken and ast.unparse(node.value) != "False") or {n.partition(".")[0] for n in names} & UNPICKLES:
+                found.append(f"{path.relative_to(package)}: {ast.unparse(node)}")
+    assert found == []
