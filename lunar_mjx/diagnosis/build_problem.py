@@ -78,6 +78,7 @@ def require_splits(
     if not splits:
         return
     names = [log.name for log in logs if isinstance(log, Log)]
+    # Tables are split by groups of points, which have names of their own.
     names += [n for log in logs if not isinstance(log, Log) for n in default_units(points(log)[0])[1]]
     for name, split in splits.items():
         if name not in names:
@@ -118,6 +119,7 @@ def candidates_of(run: Run, only: Sequence[str] | None = None) -> dict[str, Effe
 
 def table_problem(run: Run, logs: Sequence[SteadyLog], candidates: Mapping[str, Effect]) -> TableProblem:
     """The problem of steady-state tables: the model's wheel under the test bed's gravity."""
+    # Beds that state no gravity stand on Earth. One bed stands for all tables, so it has one gravity.
     gravities = {float(log.gravity_m_s2 or EARTH_GRAVITY) for log in logs}
     if len(gravities) > 1:
         raise UserError(f"{logs[0].folder}: tables of different gravity do not go into one run; compare them apart.")

@@ -36,6 +36,7 @@ def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:
         if name not in LAWS:
             raise bad_input("settings", "laws", name, "is not known", f"use some of {', '.join(LAWS)}")
     present = set(model.effect_names)
+    # All parts of a law: pressure and sinkage with another shear are a law of the user's own.
     own = next((name for name, parts in LAWS.items() if set(parts) <= present), OWN_LAW)
     laws = {own: model}
     for name in rivals:
@@ -46,6 +47,7 @@ def contact_laws(model: Model, rivals: Sequence[str]) -> dict[str, Model]:
 
 def with_law(model: Model, law: str) -> Model:
     """A copy of the model with a contact law of `LAWS` in place of its own."""
+    # Two contact laws would bear the wheel twice, and what corrects one of them has no place in another.
     foreign = _CONTACT | (OF_REECE | FINER_FORMS if law == "granular_resistance" else frozenset())
     for name in [n for n in model.effect_names if n in foreign]:
         model = model.remove(name)
@@ -69,6 +71,7 @@ def no_addition(present: Collection[str], name: str) -> str:
 
 def log_shares(laws: int) -> list[float]:
     """Log prior probability of each of some contact laws: the model's own has half of it, its rivals share the rest."""
+    # Half whatever their number: one more rival must not make the model's own law less probable.
     return [0.0] if laws == 1 else [math.log(0.5), *[math.log(0.5 / (laws - 1))] * (laws - 1)]
 
 

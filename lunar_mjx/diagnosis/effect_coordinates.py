@@ -21,6 +21,7 @@ def of_candidate(effect: Effect, values: Mapping[str, float] | None = None) -> t
         start = (values or {}).get(name)
         if p.null is not None:
             coordinates.append(_amplitude(effect.name, name, p))
+        # Shapes move by their logarithm: one that may have either sign stays at its nominal value.
         elif p.nominal > 0.0 and p.bounds[0] >= 0.0:
             coordinates.append(
                 Coordinate(effect.name, name, start or p.nominal, 0.3, *p.bounds, log=True, prior=1.0, unit=p.unit)
@@ -52,5 +53,6 @@ def default_coordinate(effect: Effect, name: str, value: float, relative: float,
     low, high = p.bounds
     if low >= 0.0 and value > 0.0:
         return Coordinate(effect.name, name, value, relative, low, high, True, prior, unit=p.unit)
+    # A value of zero has no share by which it could be moved.
     scale = relative * (abs(value) or 0.1 * (high - low))
     return Coordinate(effect.name, name, value, scale, low, high, False, prior, unit=p.unit)

@@ -50,6 +50,7 @@ def _stale(folder: Path) -> bool:
     series, refits = folder / SERIES_FILE, folder / REFITS_FILE
     if not series.is_file() or not (folder / VERDICT_FILE).is_file():
         return False
+    # Refits of an earlier comparison are of other residuals, even where their number is the same.
     return not refits.is_file() or refits.stat().st_mtime < series.stat().st_mtime
 
 
@@ -60,6 +61,7 @@ def _refit_tables(folder: Path, progress: Progress) -> None:
     if not isinstance(logs[0], SteadyLog) or verdict is None:
         return
     seen = [str(e.get("effect")) for e in verdict.get("evidence", []) if e.get("status") != "not tested"]
+    # Evidence stands in the order of the verdict: named effects first, then the most probable.
     sets = [[name] for name in seen[:MOST_REFITS]]
     if len(named := [n for n in verdict["effects"] if n in seen]) > 1:
         sets.append(named)

@@ -11,6 +11,7 @@ from typing import Any
 class Verdict(enum.Enum):
     """What the logs say about the model; `exit_status` is the exit status of the command."""
 
+    # Tens for scripts: 1x, nothing is said about physics; 2x, something is named; 3x, nothing can be named.
     NOISE_ONLY = ("NOISE_ONLY", 0)
     """Nothing is missing beyond usual errors of model, sensors and noise."""
     BAD_DATA = ("BAD_DATA", 10)

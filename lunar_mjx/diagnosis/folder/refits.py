@@ -64,6 +64,7 @@ def read_refits(folder: Path, count: int) -> dict[tuple[str, ...], Left]:
     arrays = [stored["residual"], stored["predicted"]]
     if any(a.dtype.kind != "f" or a.ndim != 2 for a in arrays):
         raise UserError(f"{path}: its arrays are no tables of numbers; make it anew with lunar-mjx studio.")
+    # Of a comparison before the present one: out of date, and nothing is broken.
     if any(a.shape != shape for a in arrays):
         return {}
     names = [tuple(str(name).split(_BETWEEN)) for name in stored["names"]]

@@ -56,6 +56,8 @@ def parsed(text: str, quantities: tuple[Quantity, ...]) -> Expr:
     """A formula from its text, such as `Max(s, 0)*z/r`, in the symbols of some quantities."""
     import sympy
 
+    # SymPy evaluates the text as Python, attributes and all. So it is only given texts that this package wrote,
+    # never one from a file or a command line.
     names = {q.name: q.symbol for q in quantities}
     return sympy.parse_expr(text, local_dict=names)
 
@@ -168,10 +170,12 @@ def unit_of(expression: Expr, quantities: Sequence[Quantity]) -> dict[str, int]:
     rng = np.random.default_rng(3)
     at = [rng.uniform(0.3, 0.9, 16) * (1.0 if q.positive else rng.choice([-1.0, 1.0], 16)) for q in used]
     base = np.broadcast_to(np.asarray(of(*at), float), (16,))
+    # Where a maximum is zero it stays zero, and tells nothing of how the formula scales.
     live = base != 0.0
     powers = {}
     for unit in dict.fromkeys(q.unit for q in used if q.unit not in ("1", "rad")):
         scaled = [a * (2.0 if q.unit == unit else 1.0) for a, q in zip(at, used, strict=True)]
+        # A product of powers grows by the same power of two at all arguments; a sum does not.
         power = np.log2(np.broadcast_to(np.asarray(of(*scaled), float), (16,))[live] / base[live])
         if not np.allclose(power, np.round(power[0]), atol=1e-9):
             raise ValueError(f"{expression} does not scale with {unit}")

@@ -99,6 +99,7 @@ def _joints(traces: Traces, log: int, row: int | None, rover: Rover) -> dict[str
     found = {}
     for wheel in rover.wheels:
         for joint, kind in ((wheel.drive, "drive"), (wheel.steer, "steer")):
+            # Where one motor drives a side, its channel stands for all wheels there; a wheel's own comes first.
             for place in filter(None, (wheel.corner, wheel.side)) if joint is not None else ():
                 angle = _series(traces, log, f"joint_{place}_{kind}_angle_rad")
                 speed = _series(traces, log, f"joint_{place}_{kind}_speed_rad_s")
@@ -106,6 +107,7 @@ def _joints(traces: Traces, log: int, row: int | None, rover: Rover) -> dict[str
                     found.setdefault(joint, _values(traces, angle, row))
                 elif speed is not None and kind == "drive":
                     time, rate = _values(traces, speed, row)
+                    # From no known start: on a wheel, which is round, the constant does not show.
                     way = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(time))])
                     found.setdefault(joint, (time, way[: len(time)]))
     return {joint: known for joint, known in found.items() if len(known[0])}

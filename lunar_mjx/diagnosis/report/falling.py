@@ -129,6 +129,7 @@ def _worst(steps: Sequence[Step], splits: Sequence[str]) -> list[tuple[str, str,
 def _broken(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places and values of a line that breaks where measurements pause."""
     steps = np.diff(x)
+    # Stamps that repeat would make the usual step zero, and every step a pause.
     pauses = np.flatnonzero(steps > FILM.gap * max(float(np.median(steps)), 1e-12)) + 1 if len(x) > 2 else []
     return np.insert(x.astype(float), pauses, np.nan), np.insert(y.astype(float), pauses, np.nan)
 

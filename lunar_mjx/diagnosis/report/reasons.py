@@ -31,6 +31,7 @@ def reason(
     probability = _number(evidence.get("probability"))
     if name in named:
         sentences.append("This is what the measurements ask for.")
+        # Of several named effects the verdict claims that they act together: one alone may leave the error as it is.
         own = errors.get("" if len(named) > 1 else name, errors.get(name))
         if own is not None and before is not None:
             with_others = (
@@ -46,6 +47,7 @@ def reason(
         )
     if name in errors and before is not None:
         left = errors[name]
+        # One parameter more lessens any fitted error a little, by noise alone: two per cent are no fall.
         falls = left < 0.98 * before
         tail = f"leaves {shown(left)} of {shown(before)} sigma" if falls else "does not make the error smaller"
         best = errors.get("") if "" in errors else errors.get(named[0]) if named else None
@@ -66,6 +68,7 @@ def reason(
         )
     note = str(evidence.get("reason") or "")
     if probability is None and note:
+        # A run folder that was received may hold a note of any length.
         sentences.append(f"The diagnosis notes: {note[:200]}.")
     return " ".join([*sentences, *_probable(probability)])
 

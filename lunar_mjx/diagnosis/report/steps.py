@@ -72,6 +72,7 @@ def chain(results: Sequence[Result]) -> list[Step]:
                     else (f"the model with {names}, refitted", f"+ {names}")
                 )
                 steps.append(Step(*words, result.name, result, row))
+            # Of the last run alone: what an earlier one proposed is what the next one was made with.
             elif last:
                 names = label.removeprefix("with ")
                 model = f"{result.name}'s model with {names} added" if before else f"the model with {names}"

@@ -62,6 +62,7 @@ def hypotheses(result: Result) -> list[Block]:
     blocks: list[Block] = []
     if listed := verdict.get("probabilities"):
         rows = [[name, percent(p)] for name, p in listed.items() if p >= LISTED]
+        # Dozens of hypotheses below a thousandth would bury the few that are weighed against each other.
         rest = sum(p for p in listed.values() if p < LISTED)
         rows += [[f"{len(listed) - len(rows)} others together", percent(rest)]] if len(rows) < len(listed) else []
         note = (
@@ -140,6 +141,7 @@ def parameters(first: Result, last: Result) -> list[Block]:
             sa, sb = ((t.get("std") or {}).get(name) for t in (old, new))
             unit = (parameters_of.get("unit") or {}).get(name, "")
             given = (old.get("given") or {}).get(name)
+            # Dozens of parameters that no fit has moved would hide those that took up what was missing.
             if given is not None and a is not None and b is not None and all(_alike(given, v) for v in (a, b)):
                 still.append(f"{effect}.{name}")
                 continue

@@ -25,6 +25,7 @@ def shown(value: Any, digits: int = 3) -> str:
     """A number in a few digits; a dash for None and NaN."""
     if not isinstance(value, int | float) or isinstance(value, bool) or math.isnan(value):
         return "-"
+    # From here on a power of ten is shorter than the zeros.
     size = abs(value)
     if size and (size >= 1e5 or size < 1e-3):
         return f"{value:.{digits - 1}e}"

@@ -45,6 +45,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
         sections.append(_why(judge, results))
     sections.append(Section("Parameters", tables.parameters(results[0], results[-1])))
     sections.append(Section("Provenance", tables.provenance(results)))
+    # A campaign of thirty drives would make a paragraph of the title.
     logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
     title = f"Criticism of a model: {and_list(logs[:4])}" + (f" and {len(logs) - 4} more" if len(logs) > 4 else "")
     shown_sections = [s for s in sections if s.blocks]
@@ -119,6 +120,7 @@ def _why(judge: Result, results: Sequence[Result]) -> Section:
             "the two effects apart."
         )
         blocks.append(Figure(figures.isolability(table), caption, least=300 + 36 * len(table)))
+    # The last run that names something: once that was added, later verdicts may have nothing to show.
     named = next((r for r in reversed(results) if (r.verdict or {}).get("effects")), judge)
     blocks += explore.gallery(named)
     return Section("Why: the evidence for every effect", blocks)

@@ -49,6 +49,7 @@ _SPLITS = {
 
 def compare(run: Run, problem: Problem, progress: Progress) -> Refit:
     """The model as given and refitted; writes `comparison.json`, `fitted.toml` and the series."""
+    # Later verbs on this run weigh by what it was compared with, and not by what is usual in their version.
     run.save(RUN_FILE, {**run.load(RUN_FILE), "settings": dataclasses.asdict(problem.settings)})
     own = problem.own
     progress("refitting the model", 0.0)
@@ -95,6 +96,7 @@ def diagnose(
     def over() -> bool:
         """Asked before each further refit: whether it and what comes after it would last longer than the time given."""
         now, writing = time.monotonic(), problem.own.writing
+        # The mean of those that were made: how long the next one takes is known when it has ended.
         a_refit = (now - begun) / next(turns)
         return now > end or (writing > 0.0 and now + (1.0 + writing) * a_refit > begun + seconds)
 
@@ -221,6 +223,7 @@ def parameter_table(form: MeasuredForm, u: np.ndarray, covariance: np.ndarray, p
         c = form.coordinates[i]
         entry = table.setdefault(c.effect, {"value": {}, "std": {}, "given": {}, "unit": {}})
         entry["value"][c.name] = float(c.value(u[i]))
+        # Rounding leaves the variance of what is hardly told a little below zero.
         entry["std"][c.name] = c.std(u[i], math.sqrt(max(float(covariance[k, k]), 0.0)))
         entry["given"][c.name], entry["unit"][c.name] = c.start, FACTOR_UNIT if c.factor else c.unit
     return table
@@ -271,6 +274,7 @@ def save_series(
     # Signatures are whitened, and only what is whitened can be held beside them: kept where it is not what is told.
     whitened = np.vstack([own.residual(own.origin()), *(f.residual(u) for f, u in fits.values())])
     more = {} if np.array_equal(whitened, residual, equal_nan=True) else {"whitened": whitened}
+    # Points of tables have no time; NaN keeps one entry for each observation.
     time = np.concatenate(
         [np.full(s.stop - s.start, np.nan) if s.time is None else s.time for s in observations.series]
     )
@@ -518,6 +522,7 @@ def _evidence(
                 reason=reason,
             )
         )
+    # As the verdict names them, then by probability: what was not refitted has none, and comes behind.
     order = {name: i for i, name in enumerate(named)}
     rows.sort(key=lambda e: (order.get(e.effect, len(order)), -np.nan_to_num(e.probability), -e.z))
     return tuple(rows), tuple(e.effect for e in rows if e.status == "not tested")
@@ -528,6 +533,7 @@ def _cosines(refit: Refit, least_signal: float) -> dict[str, dict[str, float]]:
     linear = refit.linear
     whole = linear.gram.matrix.sum(axis=0)[:-1, :-1]
     calibrated = np.concatenate([*linear.calibration.values(), np.zeros(0)]).astype(int)
+    # What is left of a signature once the model's own parameters, within their priors, have taken up what they can.
     own = np.setdiff1d(linear.always[linear.amplitudes.field[linear.always] < 0], calibrated)
     scale = linear.amplitudes.std
     inner = np.eye(len(own)) + scale[own, None] * whole[np.ix_(own, own)] * scale[own]

@@ -44,6 +44,7 @@ class Account:
 
 def account(gains: np.ndarray) -> Account:
     """The sum of (unit,) gains with its standard error; NaN for fewer than two."""
+    # Of a sum, not of a mean: a name has to pay by what it gains on all that was held out.
     se = math.sqrt(len(gains)) * float(np.std(gains, ddof=1)) if len(gains) >= FEWEST else math.nan
     return Account(float(np.sum(gains)), se, len(gains))
 
