@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from lunar_mjx.diagnosis.report import explore
+from lunar_mjx.diagnosis.report import explore, figures
 from lunar_mjx.diagnosis.report.read import Result, Traces
 from lunar_mjx.diagnosis.report.steps import chain
 from lunar_mjx.inference.observations import Observations, Series
@@ -63,6 +63,19 @@ def test_the_title_of_a_map_names_all_that_was_added(result):
     traces = dataclasses.replace(result.traces, labels=("as given", "refitted", f"with {names}"))
     (block,) = explore.panels(chain([dataclasses.replace(result, traces=traces)]))
     assert block.figure.layout.annotations[-1].text == f"3. + {names} (proposed)"
+
+
+def test_names_from_files_are_no_markup_in_figures(result):
+    """Plotly reads a few tags, links among them, in whatever it draws as text."""
+    link = '<a href="x">climb</a>'
+    o = dataclasses.replace(result.traces.observations, unit_names=("flat", link))
+    labels = ("as given", "refitted", f"with {link}")
+    traces = dataclasses.replace(result.traces, observations=o, labels=labels)
+    (block,) = explore.panels(chain([dataclasses.replace(result, traces=traces)]))
+    drawn = [block.figure, figures.bars({link: 0.5}, "probability, %"), figures.isolability({link: {link: 1.0}})]
+    for figure in drawn:
+        words = str(json.loads(figure.to_json()))  # JSON itself spells "<" otherwise
+        assert "&lt;a" in words and "<a" not in words
 
 
 def test_of_many_channels_the_worst_have_rows_and_all_are_in_the_list(result, monkeypatch):
