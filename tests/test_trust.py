@@ -15,6 +15,7 @@ from lunar_mjx.agents.play import open_agent
 from lunar_mjx.agents.policy import load_policy, save_policy
 from lunar_mjx.diagnosis.folder.stored import read_arrays
 from lunar_mjx.diagnosis.report import write_report
+from lunar_mjx.diagnosis.report.read import read_result
 from lunar_mjx.diagnosis.runs import FORMAT, RUN_FILE, load_run
 from lunar_mjx.effects import catalogue
 from lunar_mjx.errors import UserError
@@ -123,6 +124,8 @@ def test_a_run_folder(mine, run, tmp_path):
     assert run("report", by_model, "--trust", "-o", tmp_path / "report.html").status == 0
     assert not _ran(mine), "a report runs nothing, trusted or not"
     with trust.trusting():
+        # What of a page asks for the model depends on what was found; here nothing was.
+        assert read_result(by_model).model is None and not _ran(mine)
         assert "mine" in load_run(by_model).model.effect_names
 
 
