@@ -124,6 +124,7 @@ def watch(
         raise bad_input("watch", "--hours", hours, "is no time between false alarms", "give hours above 0")
     run = run if isinstance(run, Run) else load_run(run)
     follower = Follower(run)
+    # Both refuse at once what cannot be watched, and not when the first look comes.
     known_logs(run)
     _read(path, follower)
     place = run.folder / "watch" if out is None else Path(out)
@@ -199,6 +200,7 @@ class _Watch:
     def _follow(self, log: Log, found: Cut, until_s: float, once: bool) -> Iterator[Alarm]:
         """Takes the windows that are new and complete."""
         begun = self.seen[-1] if self.seen else -math.inf
+        # Windows are cut anew at every look: rounding must not show one twice.
         new = np.flatnonzero((found.start_s > begun + 1e-6) & (found.start_s + found.seconds <= until_s + 1e-6))
         for at in range(0, len(new), WATCHING.chunk):
             part = new[at : at + WATCHING.chunk]
@@ -214,6 +216,7 @@ class _Watch:
                     alarm = self._alarm(change, steps)
                     self.open.append((alarm, change))
                     yield alarm
+        # Of a finished log alarms are named at its end, when all that followed is known.
         yield from self._name(log, found, False) if not once else ()
 
     def _alarm(self, change: Change, steps: Steps) -> Alarm:

@@ -33,10 +33,12 @@ def _radius(ctx, a, value):
 
 
 def _stiffness(ctx, a, value):
+    # Both of Bekker's moduli, so that a share is the same for wheels of any width.
     return dataclasses.replace(value, k_c=value.k_c * (1.0 + a), k_phi=value.k_phi * (1.0 + a))
 
 
 def _strength(ctx, a, value):
+    # Cohesion and friction together: the share is then the same at any load.
     return dataclasses.replace(value, tan_phi=value.tan_phi * (1.0 + a), cohesion=value.cohesion * (1.0 + a))
 
 
