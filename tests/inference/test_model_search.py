@@ -10,6 +10,7 @@ import pytest
 
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude, probabilities
+from lunar_mjx.inference.deadline import TimeUp
 from lunar_mjx.inference.evidence import EvidenceError, Gram, NoiseSize
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Linear, Term, shifted
 from lunar_mjx.inference.weighing.search import Hypothesis, _carried_over, _Search, search
@@ -227,6 +228,44 @@ def test_what_is_most_like_what_is_unlisted_is_asked_before_what_estimates_promi
     usual = first(nothing)
     (other,) = set(EFFECTS) - usual - {sorted(set(EFFECTS) - usual)[0]}
     assert first(nothing | {other: 0.9}) == {other}
+
+
+class Seen(ToyForm):
+    """A toy whose effects have been seen to gain, whatever their linear estimates promise; what was asked is noted."""
+
+    late_race = False
+
+    def __init__(self, value):
+        super().__init__(value)
+        self.made, self.asked, self.gains = [], [], {}
+
+    def refit(self, effects, near, start):
+        self.made.append(effects)
+        return super().refit(effects, near, start)
+
+    def promising(self, refit):
+        self.asked.append(refit.effects)
+        if self.late_race:
+            raise TimeUp
+        return {e: gain for e, gain in self.gains.items() if e not in refit.effects}
+
+
+def test_what_has_been_seen_to_gain_is_refitted_first():
+    form = Seen(measured(0, wave=0.8))
+    form.gains = {"twin": 30.0, "square": 1.0}
+    found = search([form], most_refits=12, most_terms=4, window=4.0)
+    assert form.made[:2] == [frozenset(), frozenset({"twin"})]
+    assert form.asked[0] == frozenset() and len(form.asked) == len(set(form.asked)), "each set is asked about once"
+    # one nat is less than its odds: its estimate speaks for itself
+    assert frozenset({"square"}) not in form.made[:3]
+    assert conclude(found, 0.95).effects == ("wave",)
+
+
+def test_a_search_ends_where_the_time_is_up_before_gains_were_seen():
+    form = Seen(measured(0, wave=0.8))
+    form.late_race = True
+    found = search([form], most_refits=12, most_terms=4, window=4.0)
+    assert form.made == [frozenset()] and not found.complete
 
 
 def test_a_refit_that_fails_is_no_hypothesis_and_is_told():

@@ -168,6 +168,10 @@ class DriveForm(MeasuredForm):
             u, linear = self._first_refit()
         return Refit(self.name, effects, u, linear)
 
+    def promising(self, refit: Refit) -> Mapping[str, float]:
+        """See `Form`: by a race of all that may be missing beside a refit."""
+        return self._refits.race(refit)
+
     def _first_refit(self) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model as it is ends, and what hypotheses need there; its errors are learnt."""
         beside = None if self._rival_of is None else self._rival_of.for_rival()
@@ -181,9 +185,9 @@ class DriveForm(MeasuredForm):
 
     def for_rival(self) -> Beside:
         """Where the model as it is has been refitted, for a rival that is weighed with the same errors."""
-        base, ended = self._refits.base, self._refits.ended
-        u = self.origin() if ended is None else ended
-        return Beside(self.drives, u, None if base is None else base.sizes, self.errors)
+        base = self._refits.base
+        u, sizes = (self.origin(), None) if base is None else (base.u, base.sizes)
+        return Beside(self.drives, u, sizes, self.errors)
 
     def alone(self, refit: Refit) -> np.ndarray:
         """See `MeasuredForm`; from the refit's parameters and from those as given."""

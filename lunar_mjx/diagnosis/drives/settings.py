@@ -58,12 +58,10 @@ class DriveSettings(SearchSettings):
     """s; over which readings are averaged before a model is held against them; 0 for every reading by itself."""
 
     # --- effort ------------------------------------------------------------------------------------------------------
-    most_refits: int = 8
+    most_refits: int = 12
     """1; refits of a search, each of which simulates some hundred drives."""
     most_scored: int = 8
     """1; effects beside a set that are scored with sizes of their own, each of which takes a second or more."""
-    most_rounds: int = 2
-    """1; rounds of refit and re-linearisation."""
     most_steps: int = 12
     """1; places of a refit of the model as it is at most at each of which errors are learnt, once it was led there."""
     most_jacobians: int = 5

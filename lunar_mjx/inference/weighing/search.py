@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from lunar_mjx.inference.weighing.hypotheses import EFFECT, UNLISTED, Form, Refi
 
 Terms = frozenset[Term]
 
+FIRST_SEEN = 3
+"""Effects beside one set that are refitted since they have been seen to gain, before what linear estimates promise."""
 LEAST_SIGNAL = 1.0
 """Length in sigma of a signature at its prior size below which no data can speak for or against an effect or an
 unlisted input: it is undecidable, and keeps its prior probability without being listed."""
@@ -182,6 +184,7 @@ class _Search:
       record: nats that refits of each effect beside a form have been promised, and how many of these they kept.
       asked: form and effects of sets beside which a doubted effect was refitted.
       over: whether time was up within a refit.
+      seen: what `Form.promising` told of effects beside a refitted set, by form and effects.
       looked_alike: number of effects asked for as most like what is unlisted beside a set, by form and effects.
     """
 
@@ -201,6 +204,7 @@ class _Search:
     record: dict[tuple[str, str], tuple[float, float]] = dataclasses.field(default_factory=dict)
     asked: set[tuple[str, frozenset[str]]] = dataclasses.field(default_factory=set)
     over: bool = False
+    seen: dict[tuple[str, frozenset[str]], Mapping[str, float]] = dataclasses.field(default_factory=dict)
     looked_alike: dict[tuple[str, frozenset[str]], int] = dataclasses.field(default_factory=dict)
 
     @property
@@ -236,14 +240,26 @@ class _Search:
         # door on no effect before that has been refitted.
         listed = [h for h in self.known.values() if not any(t.kind == UNLISTED for t in h.terms)]
         best = max(listed, key=lambda h: h.log_posterior)
-        # Before anything else beside a new name, the set without it from there: it may have found a better optimum.
         leads = max((h for h in listed if h.refitted), key=lambda h: h.log_posterior)
+        # All that was seen to gain beside one set comes before what follows from the first of them.
+        if self.refit_seen(by_name[leads.form], provisional):
+            return True
+        # Before anything else beside a new name, the set without it from there: it may have found a better optimum.
         doubtful = [leads.effects - {e} for e in sorted(leads.effects - self.challenged(leads.form))]
         if doubtful:
             self.refit(by_name[leads.form], doubtful[0], leads)
             provisional(self.ranked(False))
             return True
-        alike = self.alike(leads)
+        if (leads.form, leads.effects) not in self.seen:
+            try:
+                self.look(by_name[leads.form], leads)
+            except TimeUp:
+                self.over = True
+                return True
+            if self.refit_seen(by_name[leads.form], provisional):
+                return True
+        # What was seen to gain nothing beside the best set needs no refit to be told so.
+        alike = [] if self.seen[leads.form, leads.effects] else self.alike(leads)
         if alike:
             self.looked_alike[leads.form, leads.effects] = self.looked_alike.get((leads.form, leads.effects), 0) + 1
             form, wanted = by_name[leads.form], leads.effects | {alike[0]}
@@ -405,6 +421,38 @@ class _Search:
         scored = self.known.values()
         linear = {next(iter(h.effects - best.effects)): h.log_posterior for h in scored if _one_more(h, best)}
         return sorted(self.not_refitted(best), key=lambda n: -linear.get(n, -math.inf))
+
+    def look(self, form: Form, leads: Hypothesis) -> None:
+        """Takes down what each effect is seen to gain beside a refitted set.
+
+        Raises:
+          TimeUp: before that was known.
+        """
+        try:
+            gains = form.promising(leads.refit) if len(leads.terms) < self.most_terms else {}
+        except EvidenceError:
+            gains = {}
+        self.seen[form.name, leads.effects] = gains
+
+    def refit_seen(self, form: Form, provisional: Callable[[ModelSearch], None]) -> bool:
+        """Refits the next effect that has been seen to gain, beside that set; whether there was one."""
+        for (name, effects), gains in self.seen.items():
+            wanted = self.gaining(form, effects, gains) if name == form.name else []
+            beside = self.known.get((form.name, form.listed(effects)))
+            if wanted and beside is not None:
+                self.refit(form, effects | {wanted[0]}, beside, wanted[0])
+                provisional(self.ranked(False))
+                return True
+        return False
+
+    def gaining(self, form: Form, effects: frozenset[str], gains: Mapping[str, float]) -> list[str]:
+        """Of the first effects that have been seen to gain beside a set those that no refit has tried, most first.
+
+        Those count that have gained more than their odds ask for: they are already more probable than not.
+        """
+        odds = {t.name: t.log_prior for t in form.terms if t.kind == EFFECT}
+        first = sorted((e for e in gains if gains[e] + odds[e] > 0.0), key=lambda e: -gains[e])[:FIRST_SEEN]
+        return [e for e in first if (form.name, effects | {e}) not in self.done]
 
     def alike(self, leads: Hypothesis) -> list[str]:
         """Effects that no refit has tried beside a refitted set, the one most like what is unlisted there first.

@@ -166,5 +166,10 @@ def test_a_program_holds_what_moves_and_what_that_needs(logs, runs):
     assert held("ruts") == {"ruts", "rim_contact"}
     assert held("coulomb_friction", "viscous_friction") == {"coulomb_friction", "viscous_friction"}
     assert held("viscous_friction") == {"coulomb_friction", "viscous_friction"}, "the smallest that is there already"
+    problem.devote(frozenset({"viscous_friction"}))
+    assert held("viscous_friction") == {"viscous_friction"}, "simulated often enough for a program of its own"
+    assert held("coulomb_friction") == {"coulomb_friction", "viscous_friction"}
+    problem.devote(frozenset({"ruts"}))
+    assert held("ruts") == {"ruts", "rim_contact"}
     alone = DriveProblem(logs, model, {"ruts": catalogue.get("ruts")})
     assert [n.reason for n in alone.not_tested] == ["needs rim_contact, which the model lacks"]

@@ -177,12 +177,6 @@ class Descent:
         Raises:
           EvidenceError: the simulation diverged at the start.
         """
-        # Slopes of instruments hold however far they move, and scales of inputs are another rover's. The others have a
-        # box about the place: were the whole step shortened until the longest of them fits, one that does almost
-        # nothing, and so has far to go, would hold back all.
-        longest = self._settings.longest_step
-        linear = np.array([is_linear(self._prior.places.coordinates[i]) for i in free], bool)
-        scaled = (self._prior.field_of[free] < 0) & ~linear
         low, high = self._drives.bounds(free)
         residual, trials = self._left(cost, u), min(len(DRIVE_REFIT.factors), self._drives.together)
         if not np.isfinite(residual).all():
@@ -193,8 +187,7 @@ class Descent:
         while True:
             downhill = cost.downhill(jacobian, residual, u[free])
             dampings = damping * np.array(DRIVE_REFIT.factors[:trials])
-            near = np.where(scaled, np.maximum(low, u[free] - longest), low)
-            far = np.where(scaled, np.minimum(high, u[free] + longest), high)
+            near, far = within_box(self._prior, free, u[free], low, high, self._settings.longest_step)
             steps = [
                 bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], near, far) for d in dampings
             ]
@@ -247,3 +240,21 @@ class Descent:
     def _lefts(self, cost: Cost, rows: np.ndarray) -> list[np.ndarray]:
         """Whitened residual (fitted,) at each of some places (m, coordinates)."""
         return [cost.white(self._errors.observations.value - v) for v in self._drives.predict(rows)]
+
+
+def within_box(
+    prior: Prior, free: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (free,), (free,) of a step by one Jacobian: those of the coordinates, and a box about the place.
+
+    Slopes of instruments hold however far they move, and scales of inputs are another rover's. The others have a box:
+    were the whole step shortened until the longest of them fits, one that does almost nothing, and so has far to go,
+    would hold back all.
+
+    Args:
+      prior: of what moves. free: coordinates. x: (free,) the place. low, high: (free,) bounds of the coordinates.
+      longest: half the box, in scales.
+    """
+    linear = np.array([is_linear(prior.places.coordinates[i]) for i in free], bool)
+    scaled = (prior.field_of[free] < 0) & ~linear
+    return np.where(scaled, np.maximum(low, x - longest), low), np.where(scaled, np.minimum(high, x + longest), high)

@@ -212,6 +212,19 @@ class OwnRefit:
             self.errors.forget(self.drives.observations)
         return u
 
+    @contextlib.contextmanager
+    def under_large_errors(self) -> Iterator[None]:
+        """A time within which errors of channels begin anew, and are no smaller than the least that refits are led by.
+
+        Within `apart`, which brings back what they were.
+        """
+        self.errors.forget(self.drives.observations)
+        self.errors.floor = min(self.settings.annealing, default=0.0)
+        try:
+            yield
+        finally:
+            self.errors.floor = 0.0
+
     def approach(
         self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool
     ) -> tuple[np.ndarray, Sizes, np.ndarray]:

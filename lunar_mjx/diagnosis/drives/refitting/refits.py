@@ -16,9 +16,9 @@ from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
 from lunar_mjx.diagnosis.drives.refitting.own import Base, OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.prior import Prior
+from lunar_mjx.diagnosis.drives.refitting.race import Race
 from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
-from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Refit, Term
 
 
@@ -31,7 +31,6 @@ class Refits:
       prior: of what moves. errors: of the readings. terms: everything that may be the matter. settings: effort.
       own: refit of the model as it is. acting: the place (coordinates,) of another with an effect of some size.
       base: the refit of the model as it is by itself; None before.
-      ended: (coordinates,) where that refit has ended.
       slopes: coordinates and derivatives (n, free) by them at the end of each refit, by its effects.
       learnt: errors of measurements at the end of each refit, by its effects.
       begun: sets of effects that were refitted.
@@ -48,7 +47,6 @@ class Refits:
     own: OwnRefit
     acting: Callable[[np.ndarray, str], np.ndarray]
     base: Base | None = None
-    ended: np.ndarray | None = None
     slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
     learnt: dict[frozenset[str], Errors] = dataclasses.field(default_factory=dict)
     begun: set[frozenset[str]] = dataclasses.field(default_factory=set)
@@ -57,16 +55,13 @@ class Refits:
         """Where (coordinates,) the model as it is ends from its own refit, and what hypotheses need there.
 
         Args:
-          base: its own refit. The time may cut what follows short.
+          base: its own refit.
 
         Raises:
           EvidenceError: nothing can be told of that place.
         """
-        self.base, self.ended = base, base.u
-        self.slopes[frozenset()] = base.free, base.slopes
-        u, linear = self._end(base)
-        self.ended = u
-        return u, linear
+        self.base = base
+        return base.u, self._weighed(base.u, frozenset(), base.free, base.slopes)
 
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
@@ -86,6 +81,7 @@ class Refits:
         free = self.prior.places.free(effects)
         first = bool(effects) and effects not in self.begun
         self.begun.add(effects)
+        self.drives.devote(effects)
         with self.own.apart(None if first or near is None else self.learnt.get(near.effects), self.base):
             if first:
                 u, slopes = self.own.anew(effects, self._acting(effects))
@@ -94,6 +90,25 @@ class Refits:
                 self.drives.about(self.base.u if near is None else near.u)
                 u, _, slopes = self.own.approach(self._start(free, near, start), free, sizes, True)
             return u, self._weighed(u, effects, free, slopes)
+
+    def race(self, refit: Refit) -> dict[str, float]:
+        """What each effect that a refit is without gains beside it by a few steps, nats; see `Race`.
+
+        Args:
+          refit: of this form. Errors of the present are left as they are.
+
+        Raises:
+          EvidenceError: nothing can be told of where it stands. TimeUp: before all had run.
+        """
+        assert self.base is not None
+        free, slopes = self.slopes[refit.effects]
+        shows = refit.linear.shows()
+        wanted = {e for e in shows if shows[e] >= self.settings.least_signal} - refit.effects
+        with self.own.apart(None, self.base), self.own.under_large_errors():
+            self.drives.about(refit.u)
+            race = Race(self.own, self.descent, self.settings.longest_step, free, slopes, refit.u, None)
+            groups = [[n for n in part if n in wanted] for part in self.own.signatures.parts]
+            return race.run([names for names in groups if names], self.acting)
 
     def _acting(self, effects: frozenset[str]) -> np.ndarray:
         """(coordinates,) the model as given, with effects of some size: a linear estimate's may be absurd from afar."""
@@ -113,74 +128,17 @@ class Refits:
         promise = self.descent.promise(cost, u, free, slopes)
         return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
 
-    def _end(self, base: Base) -> tuple[np.ndarray, Linear]:
-        """Where (coordinates,) descents by the errors that were learnt end, and what hypotheses need there.
-
-        Args:
-          base: from where.
-
-        Raises:
-          EvidenceError: nothing can be told of that place.
-        """
-        u, slopes, sizes, nothing = base.u, base.slopes, base.sizes, frozenset[str]()
-        best: tuple[float, np.ndarray, np.ndarray, Linear] | None = None
-        for _ in range(self.settings.most_rounds):
-            u, slopes = self.descent.descend(u, base.free, sizes, self._base_inputs, slopes)
-            try:
-                linear = self.reached(u, nothing, base.free, slopes)
-                value, found, _ = linear.evidence(self._listed(nothing), sizes)
-            except EvidenceError:
-                # A place of which nothing can be told is not gone to; the one before it stands.
-                if best is None:
-                    raise
-                break
-            gained = math.inf if best is None else value - best[0]
-            if best is None or gained > 0.0:
-                best = value, u, slopes, linear
-            if gained < self.settings.settled:
-                break
-            sizes = self.prior.fields.led_by((found.tau, found.noise))
-        assert best is not None
-        _, u, slopes, linear = best
-        self.slopes[nothing], self.learnt[nothing] = (base.free, slopes), self.errors.present
-        return u, linear
-
     def _start(self, free: np.ndarray, near: Refit | None, start: np.ndarray | None) -> np.ndarray:
         """(coordinates,) where a refit begins that moves some coordinates: at the start, or else at a similar refit."""
-        assert self.ended is not None
+        assert self.base is not None
         u = self.prior.places.origin()
-        u[self.drives.ground] = self.ended[self.drives.ground]
+        u[self.drives.ground] = self.base.u[self.drives.ground]
         given = start if start is not None else None if near is None else near.u
         if given is not None:
             u[free] = given[free]
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + DRIVE_REFIT.inside, high - DRIVE_REFIT.inside)
         return u
-
-    def reached(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
-        """What hypotheses need around the place of a refit, all with one discrepancy: that of the model as it is.
-
-        Derivatives of all but the effects' own are those at the base. They jump from one place to the next, so that two
-        places which predict alike would have evidences hundreds of nats apart. What derivatives promise beyond the
-        place by the sizes that led the descent, and no step has kept, is credited to none, but for so little that no
-        further step was asked for it. What larger discrepancy would explain is credited to all alike, as far as
-        derivatives tell it.
-
-        Args:
-          u: the place. effects: of the refit. free, slopes: as for `Descent.descend`.
-
-        Raises:
-          EvidenceError: nothing can be told of that place.
-        """
-        assert self.base is not None
-        framed, own = slopes.copy(), np.isin(free, self.base.free)
-        framed[:, own] = self.base.slopes
-        linear = self.linearised.around(u, effects, framed)
-        found = linear.evidence(self._listed(effects), self.base.sizes)[1]
-        sizes = self.prior.fields.led_by((found.tau, found.noise))
-        cost = self.descent.cost(u, free, sizes, self._base_inputs)
-        promise = self.descent.promise(cost, u, free, framed)
-        return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
 
     def alone(self, refit: Refit) -> np.ndarray:
         """(coordinates,) where the model alone predicts the fitted measurements best; from the refit's parameters and
@@ -209,11 +167,6 @@ class Refits:
         """Sizes of discrepancy (fields,) and of noise (groups,) of a refit, as they lead a descent."""
         found = near.linear.evidence(self._listed(near.effects))[1]
         return self.prior.fields.led_by((found.tau, found.noise))
-
-    @property
-    def _base_inputs(self) -> np.ndarray | None:
-        """(n, discrepancy) derivatives at the base; None where it has not been refitted."""
-        return None if self.base is None else self.prior.places.inputs(self.base.free, self.base.slopes)
 
     def _listed(self, effects: frozenset[str]) -> frozenset[Term]:
         """The terms of some effects."""

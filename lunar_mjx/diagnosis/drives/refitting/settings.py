@@ -48,6 +48,12 @@ class DriveRefit:
     """Places without a gain that are borne in a row: smaller errors promise more of the same slopes, so that one may
     lie on the way."""
 
+    # --- the race of candidates ---------------------------------------------------------------------------------------
+    race_places: int = 4
+    """Places of each candidate: where it begins, and after each step."""
+    race_dampings: tuple[float, ...] = (1.0, 1e2, 1e4)
+    """1; dampings that are tried at each, over the present one."""
+
     # --- derivatives and signatures ----------------------------------------------------------------------------------
     input_step: float = 1e-3
     """1; step of a derivative by an input before its size is known, over a field of size 1: a fiftieth of what is
