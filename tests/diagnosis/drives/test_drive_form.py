@@ -21,6 +21,7 @@ from lunar_mjx.diagnosis.drives.observations import observations_of
 from lunar_mjx.diagnosis.drives.refitting import signatures
 from lunar_mjx.diagnosis.drives.refitting.fields import USUAL_EFFECTS, Share
 from lunar_mjx.diagnosis.drives.refitting.own import OwnRefit
+from lunar_mjx.diagnosis.drives.refitting.race import Race
 from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.diagnosis.drives.usual import acting_current
@@ -181,6 +182,18 @@ def test_a_race_tells_what_would_gain_by_a_refit(hidden, amount):
     assert form.errors is errors and form._errors.floor == 0.0
     assert np.array_equal(form._refits.design.seen, seen) and np.array_equal(form._derivatives.steps, steps)
     assert set(form.promising(form.refit(frozenset({hidden}), base, None))) == {other}
+
+
+def test_a_little_of_every_effect_has_no_part_in_a_race(monkeypatch):
+    """By slopes of where the model stands it would stand in for what an effect does elsewhere."""
+    form = DriveForm(Toy({"a": 1.5, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
+    base = form.refit(frozenset(), None, None)
+    seen, design = [], form._refits.design
+    run = Race.run
+    monkeypatch.setattr(Race, "run", lambda self, *a: (seen.append(design.seen.copy()), run(self, *a))[1])
+    form.promising(base)
+    small = form._own.prior.places.amplitudes(form.candidates)
+    assert not seen[0][:, small].any() and design.seen[:, small].any()
 
 
 def test_a_race_promises_nothing_where_nothing_is_missing():
