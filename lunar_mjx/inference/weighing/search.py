@@ -9,6 +9,8 @@ worth.
 What an effect promises is believed in the share that its refits have kept. Else some larger set, of which there are
 always more than refits, would stand in front of those that were refitted by a promise that has been broken already.
 
+Where a form can see what effects gain, by a few steps of each, the first of these are refitted before all others.
+
 Before something unlisted is believed, every effect that could be seen is refitted from a place where it acts: where a
 signature saturates, the linear estimate at its null is much too low. First, and before any set that a linear estimate
 promises, come those most like what is unlisted: about a refit without it, an effect that parameters and unlisted inputs

@@ -184,6 +184,20 @@ def test_a_race_tells_what_would_gain_by_a_refit(hidden, amount):
     assert set(form.promising(form.refit(frozenset({hidden}), base, None))) == {other}
 
 
+def test_one_of_which_nothing_can_be_told_ends_no_race(monkeypatch):
+    form = DriveForm(Toy({"a": 1.5, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
+    base, settle = form.refit(frozenset(), None, None), OwnRefit.settle
+
+    def steep(self, u, *rest):
+        if u[3] != 0.0:
+            raise EvidenceError("derivatives are too steep to compute with")
+        return settle(self, u, *rest)
+
+    monkeypatch.setattr(OwnRefit, "settle", steep)
+    gains = form.promising(base)
+    assert gains["lag"] == -np.inf and gains["drag"] > 100.0
+
+
 def test_a_little_of_every_effect_has_no_part_in_a_race(monkeypatch):
     """By slopes of where the model stands it would stand in for what an effect does elsewhere."""
     form = DriveForm(Toy({"a": 1.5, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]

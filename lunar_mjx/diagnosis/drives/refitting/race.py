@@ -14,6 +14,7 @@ from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
 from lunar_mjx.diagnosis.drives.refitting.own import OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
 from lunar_mjx.diagnosis.drives.refitting.steps import bounded_step
+from lunar_mjx.inference.evidence import EvidenceError
 
 
 @dataclasses.dataclass(eq=False)
@@ -113,7 +114,11 @@ class Race:
             return None
         errors.present = runner.errors
         slopes = np.column_stack([self.slopes, own_slopes])
-        learnt, runner.sizes = own.settle(runner.u, runner.free, slopes, runner.sizes, False)
+        try:
+            learnt, runner.sizes = own.settle(runner.u, runner.free, slopes, runner.sizes, False)
+        # One of which nothing can be told says nothing of the others.
+        except (EvidenceError, np.linalg.LinAlgError):
+            return None
         runner.errors = errors.present
         places = own.prior.places
         cost = self.descent.cost(runner.u, runner.free, runner.sizes, places.inputs(runner.free, slopes))
