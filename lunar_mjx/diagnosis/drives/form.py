@@ -157,6 +157,9 @@ class DriveForm(MeasuredForm):
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> Refit:
         """See `Form`; Levenberg-Marquardt under the covariance of noise and discrepancy.
 
+        It begins at `near`, with the effects that this is without where they act, or where a race has brought them; at
+        the start only where there is no such refit, since a linear estimate may be absurd from afar.
+
         Raises:
           TimeUp: before the refit had ended; that of the model as it is counts from wherever it has come.
         """

@@ -94,6 +94,7 @@ def grown_drives(
     new = frozenset(e.name for e in effects.values()) & set(form.candidates)
     progress("refitting with " + ", ".join(sorted(new)), 0.0)
     base = form.refit(frozenset(), None, None)
-    refit = form.refit(new, base, kept_start(run, form, new)) if new else base
+    start = kept_start(run, form, new)
+    refit = form.refit(new, base if start is None else None, start) if new else base
     moved = [*form.baseline, *(i for e in new for i in form.candidates[e])]
     return fitted_model(form.coordinates, refit.u, moved, model, values)

@@ -178,7 +178,7 @@ class Descent:
           EvidenceError: the simulation diverged at the start.
         """
         low, high = self._drives.bounds(free)
-        residual, trials = self._left(cost, u), min(len(DRIVE_REFIT.factors), self._drives.together)
+        residual, tried = self._left(cost, u), np.array(DRIVE_REFIT.tried[: self._drives.together])
         if not np.isfinite(residual).all():
             raise EvidenceError("a rover's simulation diverged")
         first = present = cost.chi2(residual, u[free])
@@ -186,16 +186,17 @@ class Descent:
         normal = cost.normal(jacobian)
         while True:
             downhill = cost.downhill(jacobian, residual, u[free])
-            dampings = damping * np.array(DRIVE_REFIT.factors[:trials])
+            dampings, shares = damping * tried[:, 0], tried[:, 1]
             near, far = within_box(self._prior, free, u[free], low, high, self._settings.longest_step)
             steps = [
-                bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], near, far) for d in dampings
+                share * bounded_step(normal + np.diag(d * np.diag(normal)), downhill, u[free], near, far)
+                for d, share in zip(dampings, shares, strict=True)
             ]
             # There is nothing left to gain where these slopes hold. (The least damped step need not promise most: in a
             # box it may even lead uphill, as what it holds at a wall is never let go.)
             if max(promised(s, normal, downhill) for s in steps) < settled:
                 break
-            rows = np.repeat(u[None], trials, axis=0)
+            rows = np.repeat(u[None], len(tried), axis=0)
             rows[:, free] = np.clip(u[free] + steps, low, high)
             residuals = self._lefts(cost, rows)
             reached = [cost.chi2(r, row[free]) for r, row in zip(residuals, rows, strict=True)]

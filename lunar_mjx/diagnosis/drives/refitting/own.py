@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.refitting.derivatives import Derivatives
-from lunar_mjx.diagnosis.drives.refitting.descent import Descent
+from lunar_mjx.diagnosis.drives.refitting.descent import Cost, Descent
 from lunar_mjx.diagnosis.drives.refitting.design import Columns, Design
 from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel, Errors, Learnt
 from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
@@ -56,6 +56,28 @@ class Beside:
     errors: Errors
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Place:
+    """What is known of a place on the way of a refit.
+
+    Attributes:
+      value: log density of the measurements and of the prior there, nats. u: (coordinates,) the place.
+      asked, asked_sizes: errors that it asks for by itself, and sizes of discrepancy and noise with them.
+      errors, sizes: those of where its slopes promise to lead. slopes: (n, free) derivatives. seen: those of `Design`.
+      cost: what the next step lowers.
+    """
+
+    value: float
+    u: np.ndarray
+    asked: Errors
+    asked_sizes: Sizes
+    errors: Errors
+    sizes: Sizes
+    slopes: np.ndarray
+    seen: np.ndarray
+    cost: Cost
+
+
 @dataclasses.dataclass(eq=False)
 class OwnRefit:
     """Refits a model as it is.
@@ -97,7 +119,8 @@ class OwnRefit:
         elif self._take_kept(start, kept):
             u, arrived = start, False
         else:
-            u, sizes, _ = self.approach(self.lead(self._begin(start, free), free), free, None, learns)
+            u = self.lead(self._begin(start, free), free, self.settings.annealing)
+            u, sizes, _ = self.approach(u, free, None, learns)
             if self.drives.noise_unlearnt:
                 self.drives.learn_noise(u)
                 self.errors.forget(self.drives.observations)
@@ -116,17 +139,15 @@ class OwnRefit:
         return Base(u, free, slopes, sizes)
 
     @contextlib.contextmanager
-    def apart(self, errors: Errors | None, base: Base) -> Iterator[None]:
+    def apart(self, base: Base) -> Iterator[None]:
         """A time within which errors are a hypothesis' own; afterwards all is again as for the model as it is.
 
         Args:
-          errors: with which it begins; usual ones if None. base: the refit of the model as it is.
+          base: the refit of the model as it is.
         """
         kept = self.errors.present, self.errors.channels_held
         seen, steps = self.design.seen.copy(), self.derivatives.steps.copy()
         try:
-            if errors is not None:
-                self.errors.present = errors
             self.errors.channels_held = False
             yield
         finally:
@@ -134,21 +155,23 @@ class OwnRefit:
             self.design.seen, self.derivatives.steps = seen, steps
             self.drives.about(base.u)
 
-    def anew(self, effects: frozenset[str], start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where (coordinates,) the model with some effects ends on the way that the model as it is was refitted, and
-        derivatives (n, free) there.
+    def go_on(self, u: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where (coordinates,) a model ends from near where another has ended, and derivatives (n, free) there.
 
-        The model as it is makes up for what it lacks by all else that it has, and takes what remains for errors: from
-        there, and by these errors, an effect may have nothing to gain. Errors are those of the place afterwards.
+        With errors of its own, which begin anew and are led once more by the least ones that the model as it is was
+        led by: by the errors of another it would have to explain what that one has taken for errors.
 
         Args:
-          effects: of the model. start: (coordinates,) where they act, with the model's own parameters as given.
+          u: (coordinates,) where from. free: coordinates that are moved.
 
         Raises:
-          EvidenceError: nothing can be told of where it begins. TimeUp: before the refit was led to its end.
+          EvidenceError: nothing can be told of where it begins. TimeUp: before it was led to its end, or anything was
+            learnt of where that is.
         """
-        free = self.prior.places.free(effects)
-        u, _, slopes = self.approach(self.lead(self._begin(start, free), free, whole=True), free, None, True)
+        self.drives.about(u)
+        self.errors.forget(self.drives.observations)
+        u = self.lead(u, free, self.settings.annealing[-1:], whole=True)
+        u, _, slopes = self.approach(u, free, None, True)
         return u, slopes
 
     def _begin(self, start: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -172,7 +195,7 @@ class OwnRefit:
             u = self.descent.descend(u, np.concatenate([nuisances, places.own_ground]), usual)[0]
         return u
 
-    def lead(self, u: np.ndarray, free: np.ndarray, whole: bool = False) -> np.ndarray:
+    def lead(self, u: np.ndarray, free: np.ndarray, floors: Sequence[float], whole: bool = False) -> np.ndarray:
         """Where (coordinates,) a model comes to while errors of channels are large, and less and less so.
 
         Under small errors a descent from afar ends in the nearest of many valleys, where readings that would lead out
@@ -181,31 +204,23 @@ class OwnRefit:
         Errors are usual ones afterwards: what they are is learnt where it ends.
 
         Args:
-          u: where from. free: places of what moves. whole: whether the time may not cut it short.
+          u: where from. free: places of what moves. floors: least errors of channels, one after the other, as shares of
+            what a channel does. whole: whether the time may not cut it short.
 
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at, or before the end of
             one that is to be `whole`.
         """
-        settings, damping, sizes = self.settings, DRIVE_REFIT.damping, None
-        if not settings.annealing:
-            return u
+        looked = False
         try:
-            for floor in settings.annealing:
+            for floor in floors:
                 self.errors.floor = floor
                 # What single readings err by shows once what all of them share is known about as well as is usual.
-                single = floor <= settings.usual_error
-                for place in range(DRIVE_REFIT.most_led):
-                    slopes = self.signatures.look(u, free)
-                    _, sizes = self.settle(u, free, slopes, sizes if place else None, single)
-                    cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
-                    there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
-                    u, damping = there.u, min(there.damping, DRIVE_REFIT.renewed_damping)
-                    self.progress("refitting, with errors of channels that lessen", math.nan)
-                    if place and there.gained < DRIVE_REFIT.arrived:
-                        break
+                single = floor <= self.settings.usual_error
+                most, enough = DRIVE_REFIT.most_led, DRIVE_REFIT.arrived
+                u, looked = self.approach(u, free, None, single, most, enough, whole)[0], True
         except (EvidenceError, TimeUp) as error:
-            if sizes is None or (whole and isinstance(error, TimeUp)):
+            if not looked or (whole and isinstance(error, TimeUp)):
                 raise
         finally:
             self.errors.floor = 0.0
@@ -219,62 +234,140 @@ class OwnRefit:
         Within `apart`, which brings back what they were.
         """
         self.errors.forget(self.drives.observations)
-        self.errors.floor = min(self.settings.annealing, default=0.0)
+        self.errors.floor = next(reversed(self.settings.annealing), 0.0)
         try:
             yield
         finally:
             self.errors.floor = 0.0
 
     def approach(
-        self, u: np.ndarray, free: np.ndarray, begun: Sizes | None, learns: bool
+        self,
+        u: np.ndarray,
+        free: np.ndarray,
+        begun: Sizes | None,
+        learns: bool,
+        most: int | None = None,
+        enough: float | None = None,
+        whole: bool = False,
     ) -> tuple[np.ndarray, Sizes, np.ndarray]:
         """Where (coordinates,) the evidence of the model as it is is highest; sizes and derivatives (n, free) there.
 
         They are learnt at every Jacobian: at a poor place they are large, and a descent that kept them would end there.
-        What a refit leaves to gain goes to whatever is refitted next. The time may end it wherever it has come; errors
-        are those of the place in the end.
+        A step lowers a cost at the sizes of its beginning. Where its end does not explain more by itself, with errors
+        learnt anew, it is shortened (backtracking: Armijo 1966). The time may end it wherever it has come; errors are
+        those of the place in the end.
 
         Args:
           u: where from. free: places of what moves. begun: sizes that were found near there, or None.
           learns: whether errors of single readings are learnt; a rival is weighed against measurements with the very
             errors of the model's own form.
+          most: places that are looked at; as many as the settings say if None.
+          enough: chi-square that a place must gain for another to be looked at; what the settings call settled if None.
+          whole: whether the time may not cut it short.
 
         Raises:
-          EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at.
+          EvidenceError: nothing can be told of where it begins. TimeUp: before that was looked at, or before the end of
+            one that is to be `whole`.
         """
-        settings, damping, idle, looks = self.settings, DRIVE_REFIT.damping, 0, 0
+        settings, damping, share, end, best = self.settings, DRIVE_REFIT.damping, 1.0, u, None
         ground, sizes = HeldOutGround(self.drives, self.design, self.prior, self.errors), begun
-        best: tuple[float, np.ndarray, Errors, Sizes, np.ndarray] | None = None
-        slopes = np.zeros((0, 0))
         try:
-            for _ in range(settings.most_steps):
-                # A second look at a place has steps that fit what the first has found; a third would see the same.
-                if looks < DRIVE_REFIT.most_looks:
-                    slopes = self.signatures.look(u, free)
-                looks += 1
-                learnt, sizes = self.settle(u, free, slopes, sizes, learns)
-                cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
-                # what slopes promise has not been reached yet
-                value = learnt.log_evidence - 0.5 * self.descent.promise(cost, u, free, slopes)
-                gained = math.inf if best is None else value - best[0]
-                if best is None or gained > 0.0:
-                    best = value, u, self.errors.present, sizes, slopes
-                # Smaller errors promise more of the same slopes: one place without a gain may lie on the way.
-                idle = idle + 1 if gained < 0.5 * settings.settled else 0
+            for _ in range(settings.most_steps if most is None else most):
+                place = self._place(u, free, sizes, learns, required=best is None)
                 self.progress("refitting, and learning errors of readings", math.nan)
-                if idle > DRIVE_REFIT.most_idle:
-                    break
-                there = self.descent.step(cost, u, free, slopes, damping, settings.settled)
-                damping = min(there.damping, DRIVE_REFIT.renewed_damping)
-                looks = looks if there.gained == 0.0 else 0
-                u = ground.mapped(there.u, u, slopes, free, sizes)
-        # A place of which nothing can be told is not gone to; the best one before it stands.
-        except (EvidenceError, TimeUp):
-            if best is None:
+                if best is not None and (place is None or place.value <= best.value):
+                    share *= DRIVE_REFIT.shorter
+                    if share < DRIVE_REFIT.least_share:
+                        break
+                else:
+                    assert place is not None
+                    gained, best, share = math.inf if best is None else place.value - best.value, place, 1.0
+                    if gained < 0.5 * (settings.settled if enough is None else enough):
+                        break
+                    there = self.descent.step(place.cost, u, free, place.slopes, damping, settings.settled)
+                    if there.gained == 0.0:
+                        break
+                    damping = min(there.damping, DRIVE_REFIT.renewed_damping)
+                    end = ground.mapped(there.u, u, place.slopes, free, place.sizes)
+                self.errors.present, sizes = best.errors, best.sizes
+                u = best.u + share * (end - best.u)
+        except TimeUp:
+            if best is None or whole:
                 raise
         assert best is not None
-        _, u, self.errors.present, sizes, slopes = best
-        return u, sizes, slopes
+        self.errors.present, self.design.seen = best.asked, best.seen
+        return best.u, best.asked_sizes, best.slopes
+
+    def _place(
+        self, u: np.ndarray, free: np.ndarray, sizes: Sizes | None, learns: bool, required: bool
+    ) -> _Place | None:
+        """What a place (coordinates,) tells once errors have settled there; None where that is nothing.
+
+        Args:
+          u: the place. free, learns: as for `approach`. sizes: to begin with, or None.
+          required: whether nothing told is an error.
+
+        Raises:
+          EvidenceError: nothing can be told, and something is required. TimeUp: before anything was.
+        """
+        try:
+            slopes = self.signatures.look(u, free)
+            _, sizes = self.settle(u, free, slopes, sizes, learns)
+            value, asked, asked_sizes = self.held(u, free, slopes, sizes, learns)
+        except EvidenceError:
+            if required:
+                raise
+            return None
+        cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
+        present = self.errors.present
+        return _Place(value, u, asked, asked_sizes, present, sizes, slopes, self.design.seen.copy(), cost)
+
+    def held(
+        self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, sizes: Sizes | None, learns: bool
+    ) -> tuple[float, Errors, Sizes]:
+        """Log density of the measurements where all that a refit moves is held at a place, and of the prior there; the
+        errors that the place asks for, and sizes of discrepancy and noise with them.
+
+        What a linear model promises beyond a place may lie nowhere, and the errors that have settled are those of its
+        end. Of two places the one that explains more by itself is the better. Errors of the present stay.
+
+        Args:
+          u, free, slopes: the place (coordinates,), what moves, and derivatives (n, free). sizes: to begin with.
+          learns: whether errors of single readings are learnt.
+
+        Raises:
+          EvidenceError: derivatives are too steep to compute with.
+        """
+        kept = self.errors.present
+        columns = self.design.columns(u, free, slopes, self.prior.places.effects(free))
+        derivatives, prior = self.design.of_the_model(columns, free)
+        derivatives, prior = derivatives[:, len(free) :], prior.select(np.arange(len(free), derivatives.shape[1]))
+        fields = self.prior.fields.priors(bounded=True)
+        try:
+            found = self.errors.learn(derivatives, columns.residual, prior, fields, sizes, single=learns)
+            for _ in range(DRIVE_REFIT.most_held if learns else 0):
+                self.errors.learn_single(found)
+                found = self.errors.learn(derivatives, columns.residual, prior, fields, found.sizes, channels=False)
+            asked = self.errors.present
+        finally:
+            self.errors.present = kept
+        return found.log_evidence + self._log_prior(u, free), asked, self.prior.fields.led_by(found.sizes)
+
+    def _log_prior(self, u: np.ndarray, free: np.ndarray) -> float:
+        """Log density of the prior of a place (coordinates,), up to a constant.
+
+        That of a discrepancy is of the size that its amounts ask for: a descent may lead beyond what is usual, and
+        larger noise would explain readings for less.
+        """
+        cost = self.descent.cost(u, free, (self.prior.fields.usual, self.errors.stated_noise))
+        square, field = ((u[free] - cost.centre) / cost.std) ** 2, self.prior.field_of[free]
+        value = -0.5 * float(np.sum(square[field < 0]))
+        sizes = np.array(DRIVE_REFIT.asked_sizes)
+        for k in np.unique(field[field >= 0]):
+            own = square[field == k]
+            # half-Cauchy, as wide as usual: what is unlisted is rare, and no miracle
+            value += float(np.max(-0.5 * np.sum(own) / sizes**2 - len(own) * np.log(sizes) - np.log1p(sizes**2)))
+        return value
 
     def settle(
         self, u: np.ndarray, free: np.ndarray, slopes: np.ndarray, begun: Sizes | None, learns: bool

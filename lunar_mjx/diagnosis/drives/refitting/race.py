@@ -25,7 +25,7 @@ class Runner:
       effect: its name; empty for the model without any. own: places of its coordinates.
       free: of all that it moves, its own last.
       u: (coordinates,) where it has come. errors, sizes: as they were found there. damping: of its next step.
-      best: the highest log evidence of the places that it has come to.
+      value: log density of the measurements, and of the prior, where it has come in the end; see `OwnRefit.held`.
     """
 
     effect: str
@@ -33,9 +33,9 @@ class Runner:
     free: np.ndarray
     u: np.ndarray
     errors: Errors
-    sizes: Sizes | None
+    sizes: Sizes | None = None
     damping: float = DRIVE_REFIT.damping
-    best: float = -np.inf
+    value: float = -np.inf
 
 
 @dataclasses.dataclass(eq=False)
@@ -48,7 +48,8 @@ class Race:
     Attributes:
       own: refit of the model, by whose rules errors are learnt. descent: its costs. longest_step: half the box of a
         step, in scales. free: coordinates of the refit that all begin beside. slopes: (n, free) derivatives there.
-      u: (coordinates,) where that has ended. sizes: of discrepancy and noise there.
+      u: (coordinates,) where that has ended.
+      ends: (coordinates,) where each effect's descent has come, by its name.
     """
 
     own: OwnRefit
@@ -57,10 +58,10 @@ class Race:
     free: np.ndarray
     slopes: np.ndarray
     u: np.ndarray
-    sizes: Sizes | None
+    ends: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def run(self, groups: Iterable[Sequence[str]], acting: Callable[[np.ndarray, str], np.ndarray]) -> dict[str, float]:
-        """What each effect gains by a few steps over what the model without any does, nats.
+        """What each effect gains by a few steps over what the model without any does, nats; `ends` holds where to.
 
         Errors of channels are learnt at each place, no smaller than the present floor: at a poor place they are large.
 
@@ -77,22 +78,24 @@ class Race:
         for names in groups:
             runners = [self._runner(name, acting) for name in names]
             self._lead(runners)
-            gains |= {r.effect: r.best - alone.best for r in runners}
+            gains |= {r.effect: r.value - alone.value for r in runners}
+            self.ends |= {r.effect: r.u for r in runners}
             self.own.progress("a race of what may be missing", np.nan)
         return gains
 
     def _runner(self, effect: str, acting: Callable[[np.ndarray, str], np.ndarray]) -> Runner:
         own = self.own.prior.places.candidates[effect] if effect else np.zeros(0, int)
         free = np.concatenate([self.free, own])
-        return Runner(effect, own, free, acting(self.u, effect), self.own.errors.present, self.sizes)
+        return Runner(effect, own, free, acting(self.u, effect), self.own.errors.present)
 
     def _lead(self, runners: list[Runner]) -> None:
         """Steps of some runners, whose rovers are simulated together; one that diverges stays where it is."""
-        for last in [False] * (DRIVE_REFIT.race_places - 1) + [True]:
+        for _ in range(DRIVE_REFIT.race_steps):
             slopes = self._own_slopes(runners)
             at = [(r, own, self._settled(r, own)) for r, own in zip(runners, slopes, strict=True)]
-            if not last:
-                self._step([(r, own, cost) for r, own, cost in at if cost is not None])
+            self._step([(r, own, cost) for r, own, cost in at if cost is not None])
+        for runner in runners:
+            self._judge(runner)
 
     def _own_slopes(self, runners: Sequence[Runner]) -> list[np.ndarray]:
         """(n, own) derivatives by each one's own coordinates where it stands."""
@@ -115,19 +118,28 @@ class Race:
         errors.present = runner.errors
         slopes = np.column_stack([self.slopes, own_slopes])
         try:
-            learnt, runner.sizes = own.settle(runner.u, runner.free, slopes, runner.sizes, False)
+            _, runner.sizes = own.settle(runner.u, runner.free, slopes, runner.sizes, False)
         # One of which nothing can be told says nothing of the others.
         except (EvidenceError, np.linalg.LinAlgError):
             return None
         runner.errors = errors.present
-        places = own.prior.places
-        cost = self.descent.cost(runner.u, runner.free, runner.sizes, places.inputs(runner.free, slopes))
-        promise = self.descent.promise(cost, runner.u, runner.free, slopes)
-        runner.best = max(runner.best, learnt.log_evidence - 0.5 * promise)
-        return cost
+        return self.descent.cost(runner.u, runner.free, runner.sizes, own.prior.places.inputs(runner.free, slopes))
+
+    def _judge(self, runner: Runner) -> None:
+        """Takes down what the place of a runner explains by itself."""
+        own, errors = self.own, self.own.errors
+        if not np.isfinite(own.drives.predict(runner.u[None])).all():
+            return
+        errors.present = runner.errors
+        # what moves is held: its own slopes say nothing
+        slopes = np.column_stack([self.slopes, np.zeros((len(self.slopes), len(runner.own)))])
+        try:
+            runner.value = own.held(runner.u, runner.free, slopes, runner.sizes, False)[0]
+        except (EvidenceError, np.linalg.LinAlgError):
+            return
 
     def _step(self, at: Sequence[tuple[Runner, np.ndarray, Cost]]) -> None:
-        """One step of each, the best of a few dampings."""
+        """One step of each, the best of a few that are tried."""
         value, low_high = self.own.drives.observations.value, self.own.drives.bounds
         rows, before = [], []
         for runner, own_slopes, cost in at:
@@ -138,22 +150,21 @@ class Race:
             normal, downhill = cost.normal(white), cost.downhill(white, left, x)
             low, high = low_high(runner.free)
             box = within_box(self.own.prior, runner.free, x, low, high, self.longest_step)
-            tried = np.repeat(runner.u[None], len(DRIVE_REFIT.race_dampings), axis=0)
-            for row, factor in zip(tried, DRIVE_REFIT.race_dampings, strict=True):
+            tried = np.repeat(runner.u[None], len(DRIVE_REFIT.race_tried), axis=0)
+            for row, (factor, share) in zip(tried, DRIVE_REFIT.race_tried, strict=True):
                 stiff = normal + np.diag(runner.damping * factor * np.diag(normal))
-                row[runner.free] = np.clip(x + bounded_step(stiff, downhill, x, *box), low, high)
+                row[runner.free] = np.clip(x + share * bounded_step(stiff, downhill, x, *box), low, high)
             rows.append(tried)
         if not rows:
             return
-        count, values = len(DRIVE_REFIT.race_dampings), self.own.drives.predict(np.concatenate(rows))
+        count, values = len(DRIVE_REFIT.race_tried), self.own.drives.predict(np.concatenate(rows))
         for k, ((runner, _, cost), tried) in enumerate(zip(at, rows, strict=True)):
             lefts = [cost.white(value - v) for v in values[k * count : (k + 1) * count]]
             reached = [cost.chi2(left, u[runner.free]) for left, u in zip(lefts, tried, strict=True)]
             best = int(np.argmin(reached))
             if reached[best] < before[k]:
                 runner.u = tried[best]
-                runner.damping = max(
-                    DRIVE_REFIT.softer * DRIVE_REFIT.race_dampings[best] * runner.damping, DRIVE_REFIT.damping
-                )
+                factor = DRIVE_REFIT.race_tried[best][0]
+                runner.damping = max(DRIVE_REFIT.softer * factor * runner.damping, DRIVE_REFIT.damping)
             else:
                 runner.damping *= DRIVE_REFIT.stiffer

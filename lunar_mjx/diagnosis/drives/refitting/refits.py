@@ -11,8 +11,7 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.refitting.descent import Descent
 from lunar_mjx.diagnosis.drives.refitting.design import Design
-from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel, Errors
-from lunar_mjx.diagnosis.drives.refitting.fields import Sizes
+from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
 from lunar_mjx.diagnosis.drives.refitting.own import Base, OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.prior import Prior
@@ -32,8 +31,7 @@ class Refits:
       own: refit of the model as it is. acting: the place (coordinates,) of another with an effect of some size.
       base: the refit of the model as it is by itself; None before.
       slopes: coordinates and derivatives (n, free) by them at the end of each refit, by its effects.
-      learnt: errors of measurements at the end of each refit, by its effects.
-      begun: sets of effects that were refitted.
+      raced: (coordinates,) where races have brought effects, by the effects beside which they ran, and their own.
     """
 
     drives: DriveProblem
@@ -48,8 +46,7 @@ class Refits:
     acting: Callable[[np.ndarray, str], np.ndarray]
     base: Base | None = None
     slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
-    learnt: dict[frozenset[str], Errors] = dataclasses.field(default_factory=dict)
-    begun: set[frozenset[str]] = dataclasses.field(default_factory=set)
+    raced: dict[tuple[frozenset[str], frozenset[str]], np.ndarray] = dataclasses.field(default_factory=dict)
 
     def begin(self, base: Base) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model as it is ends from its own refit, and what hypotheses need there.
@@ -66,29 +63,22 @@ class Refits:
     def refit(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model with some effects ends, and what hypotheses need there.
 
-        A set of effects is refitted from the model as given, as the model as it is was, with errors of its own; where
-        that has been done, from a similar refit, with the errors of that one to begin with. So all hypotheses are
-        treated alike: weighed by the errors of one of them, all others would have to explain what that one has taken
-        for errors.
+        Each set has errors of its own: weighed by those of one hypothesis, all others would have to explain what that
+        one has taken for errors. An effect that was raced beside the similar refit begins where the race has brought
+        it, any other set at the similar refit.
 
         Args:
-          effects, near, start: as for `Form.refit`.
+          effects, near: as for `Form.refit`. start: where there is no `near`; else it does not count.
 
         Raises:
           EvidenceError: nothing can be told of where it begins. TimeUp: before the refit had ended.
         """
         assert self.base is not None
         free = self.prior.places.free(effects)
-        first = bool(effects) and effects not in self.begun
-        self.begun.add(effects)
+        raced = None if near is None else self.raced.get((near.effects, effects - near.effects))
         self.drives.devote(effects)
-        with self.own.apart(None if first or near is None else self.learnt.get(near.effects), self.base):
-            if first:
-                u, slopes = self.own.anew(effects, self._acting(effects))
-            else:
-                sizes = self.base.sizes if near is None else self.sizes_of(near)
-                self.drives.about(self.base.u if near is None else near.u)
-                u, _, slopes = self.own.approach(self._start(free, near, start), free, sizes, True)
+        with self.own.apart(self.base):
+            u, slopes = self.own.go_on(self._start(effects, near, start) if raced is None else raced, free)
             return u, self._weighed(u, effects, free, slopes)
 
     def race(self, refit: Refit) -> dict[str, float]:
@@ -104,21 +94,16 @@ class Refits:
         free, slopes = self.slopes[refit.effects]
         shows = refit.linear.shows()
         wanted = {e for e in shows if shows[e] >= self.settings.least_signal} - refit.effects
-        with self.own.apart(None, self.base), self.own.under_large_errors():
+        with self.own.apart(self.base), self.own.under_large_errors():
             self.drives.about(refit.u)
             # By slopes of where the model stands, a little of every effect would stand in for what one does elsewhere:
             # on a foreign Husky the hidden slip-sinkage lost 5,587 nats beside it, and gains 1,294 without.
             self.design.seen[:, self.prior.places.amplitudes(self.prior.places.candidates)] = 0.0
-            race = Race(self.own, self.descent, self.settings.longest_step, free, slopes, refit.u, None)
+            race = Race(self.own, self.descent, self.settings.longest_step, free, slopes, refit.u)
             groups = [[n for n in part if n in wanted] for part in self.own.signatures.parts]
-            return race.run([names for names in groups if names], self.acting)
-
-    def _acting(self, effects: frozenset[str]) -> np.ndarray:
-        """(coordinates,) the model as given, with effects of some size: a linear estimate's may be absurd from afar."""
-        given = self.prior.as_given()
-        for effect in sorted(effects):
-            given = self.acting(given, effect)
-        return given
+            gains = race.run([names for names in groups if names], self.acting)
+        self.raced |= {(refit.effects, frozenset({e})): u for e, u in race.ends.items()}
+        return gains
 
     def _weighed(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
         """What hypotheses need around the place (coordinates,) of a refit, by its own derivatives and errors."""
@@ -127,18 +112,21 @@ class Refits:
         found = linear.evidence(self._listed(effects), self.base.sizes if self.base else None)[1]
         sizes = self.prior.fields.led_by((found.tau, found.noise))
         cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
-        self.slopes[effects], self.learnt[effects] = (free, slopes), self.errors.present
+        self.slopes[effects] = free, slopes
         promise = self.descent.promise(cost, u, free, slopes)
         return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
 
-    def _start(self, free: np.ndarray, near: Refit | None, start: np.ndarray | None) -> np.ndarray:
-        """(coordinates,) where a refit begins that moves some coordinates: at the start, or else at a similar refit."""
+    def _start(self, effects: frozenset[str], near: Refit | None, start: np.ndarray | None) -> np.ndarray:
+        """(coordinates,) where a similar refit has ended, or else the start; effects that it is without act there."""
         assert self.base is not None
+        free = self.prior.places.free(effects)
         u = self.prior.places.origin()
         u[self.drives.ground] = self.base.u[self.drives.ground]
-        given = start if start is not None else None if near is None else near.u
-        if given is not None:
-            u[free] = given[free]
+        begun = near.u if near is not None else self.base.u if start is None else start
+        u[free] = begun[free]
+        known = near.effects if near is not None else frozenset() if start is None else effects
+        for effect in sorted(effects - known):
+            u = self.acting(u, effect)
         low, high = self.drives.bounds(free)
         u[free] = np.clip(u[free], low + DRIVE_REFIT.inside, high - DRIVE_REFIT.inside)
         return u
@@ -165,11 +153,6 @@ class Refits:
         starts = [u for u in (fitted, given) if math.isfinite(cost(u))]
         whole = bool(refit.effects)
         return min((self.descent.descend(u, free, once=True, whole=whole)[0] for u in starts), key=cost)
-
-    def sizes_of(self, near: Refit) -> Sizes:
-        """Sizes of discrepancy (fields,) and of noise (groups,) of a refit, as they lead a descent."""
-        found = near.linear.evidence(self._listed(near.effects))[1]
-        return self.prior.fields.led_by((found.tau, found.noise))
 
     def _listed(self, effects: frozenset[str]) -> frozenset[Term]:
         """The terms of some effects."""
