@@ -22,7 +22,8 @@ class DriveRefit:
     )
     """1; steps that are simulated side by side, as far as they fit into one batch: damping over the present one, and
     share of the step so damped. Where one coordinate of a hundred bends, a share of the whole step gains more than a
-    damped one: 431 of 728 nats promised at one place of a foreign Husky, where damped ones had gained 55 to 266."""
+    damped one: 431 of 728 nats promised at one place of a foreign Husky; damped ones on its way had gained 55 to
+    266."""
     damping: float = 1e-3
     """1; least damping, over the diagonal of the normal matrix: nearly a Gauss-Newton step (Marquardt 1963)."""
     stiffer: float = 1e3
