@@ -9,6 +9,7 @@ drives tell as well.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 
@@ -25,7 +26,6 @@ class ChannelErrors:
     """Observations with each size that the slow errors of their channels may have.
 
     Attributes:
-      log_scale: (levels, groups) sum of the logarithms of what whitening divides the fitted ones by.
       log_prior: (levels,) of the sizes and times: half-Cauchy in the size, for nobody knows the order of what a model
         leaves out (Gelman 2006).
     """
@@ -45,15 +45,23 @@ class ChannelErrors:
         self._levels.insert(0, (0.0, settings.error_times_s[0]))
         self._spread = spread(observations)
         self._fit = observations.in_split("fit")
+        # whitening of drives that are held out would double what takes most of the time
+        self._fitted = observations.of_rows(self._fit)
         self._made: dict[tuple[int, ...], Observations] = {}
+        self._whitens: dict[tuple[int, ...], Observations] = {}
         sizes = np.array([size for size, _ in self._levels])
         # every time is as probable as another
         self.log_prior = -np.log1p((sizes / settings.usual_error) ** 2)
         self.log_prior -= np.log(len(settings.error_times_s)) * (sizes > 0.0)
         self.log_prior[sizes < floor] = -np.inf
-        scales = [self.at(np.full(kinds, level)).log_widths()[self._fit] for level in range(len(sizes))]
-        self.log_scale = np.array([np.bincount(group[self._fit], s, minlength=kinds) for s in scales])
         self.usual = np.full(kinds, int(np.argmin(np.abs(sizes - max(settings.usual_error, floor)))))
+
+    @functools.cached_property
+    def log_scale(self) -> np.ndarray:
+        """(levels, groups) sum of the logarithms of what whitening divides the fitted ones by."""
+        kinds, group = self._kinds, self._group[self._fit]
+        scales = [self._fitted_at(np.full(kinds, level)).log_widths() for level in range(len(self._levels))]
+        return np.array([np.bincount(group, s, minlength=kinds) for s in scales])
 
     def shares(self, levels: np.ndarray) -> dict[str, float]:
         """The size of a channel's errors, as a share of what it does, at a level (groups,) of each group."""
@@ -75,14 +83,26 @@ class ChannelErrors:
 
     def at(self, levels: np.ndarray) -> Observations:
         """The observations with errors of a level (groups,) of each group."""
-        key = tuple(int(level) for level in levels)
+        key = tuple(map(int, levels))
         if key not in self._made:
-            times, made = self.times_s(levels), self._observations
-            chosen = {c: share * self._spread[c] for c, share in self.shares(levels).items() if share > 0.0}
-            for time_s in sorted({times[c] for c in chosen}):
-                made = with_discrepancy(made, {c: v for c, v in chosen.items() if times[c] == time_s}, time_s)
-            self._made[key] = made
+            self._made[key] = self._with_errors(self._observations, levels)
         return self._made[key]
+
+    def _fitted_at(self, levels: np.ndarray) -> Observations:
+        """The fitted ones, as `at`."""
+        key = tuple(map(int, levels))
+        if key not in self._whitens:
+            self._whitens[key] = self._with_errors(self._fitted, levels)
+        return self._whitens[key]
+
+    def _with_errors(self, observations: Observations, levels: np.ndarray) -> Observations:
+        times, shares = self.times_s(levels), self.shares(levels)
+        measured = {s.channel for s in observations.series}
+        chosen = {c: share * self._spread[c] for c, share in shares.items() if share > 0.0 and c in measured}
+        for time_s in sorted({times[c] for c in chosen}):
+            mine = {c: v for c, v in chosen.items() if times[c] == time_s}
+            observations = with_discrepancy(observations, mine, time_s)
+        return observations
 
     def levels(self, columns: np.ndarray, residual: np.ndarray, start: np.ndarray | None = None) -> Levels:
         """The fitted observations with each size of errors.
@@ -93,9 +113,7 @@ class ChannelErrors:
         """
 
         def whiten(levels: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-            whole = np.zeros((len(self._fit), fitted.shape[1]))
-            whole[self._fit] = fitted
-            return self.at(levels).whiten(whole)[self._fit]
+            return self._fitted_at(levels).whiten(fitted)
 
         none = np.full_like(self.usual, int(np.argmax(self.log_prior > -np.inf)))
         starts = np.stack([self.usual, none] if start is None else [start])

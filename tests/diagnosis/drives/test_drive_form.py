@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -32,6 +33,7 @@ from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, helps
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
+from lunar_mjx.diagnosis.weighed.held_to_account import account
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.coordinates import Coordinate
@@ -485,6 +487,26 @@ def test_a_name_has_to_help_drives_that_chose_nothing(everywhere: bool, verdict:
     assert details["held_out_of_usual"]["units"] == 16
     assert (after.effects, "not named" in sentence) == ((("drag",), False) if everywhere else ((), True))
     assert _held_to_account(said, said.sentence, found, 0.0) == (said, said.sentence, {})
+
+
+@pytest.mark.parametrize(
+    ("gains", "by_chance", "helps"),
+    [
+        # skewed, and all of them gains: by Student's t no more than 0.92
+        ([200.0, 50.0, 30.0, 10.0, 4.0, 1.0, 1.0, 1.0], 2 / 2**9, True),
+        # a large one carries the sum, and half of the flips carry it, too
+        ([200.0, -50.0, 30.0, -40.0, 4.0, -1.0, 1.0, -1.0], 103 / 2**8, False),
+        ([3.0, -2.0, 1.0], 3 / 2**3, False),
+        ([1.0, 2.0], 1 / 2**2, True),
+        ([-1.0, 2.0], 2 / 2**2, False),
+    ],
+)
+def test_gains_on_held_out_pieces_are_held_against_flips_of_their_signs(gains, by_chance, helps):
+    """A name helps where no more than one flip of signs in twenty leads as far, or where all of few pieces gain."""
+    found = account(np.array(gains))
+    flips = np.array(list(itertools.product([1.0, -1.0], repeat=len(gains)))) @ gains
+    assert found.by_chance == pytest.approx(np.mean(flips >= sum(gains) - 1e-9)) == pytest.approx(by_chance)
+    assert found.helps(0.95) is helps
 
 
 def test_a_descent_draws_far_amplitudes_as_students_t_does():

@@ -344,7 +344,7 @@ PORTS = {
 
 
 def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping[str, str]) -> Diagnosis:
-    """The diagnosis, or UNKNOWN where what it names does not help held-out windows with 95 % (Student's t).
+    """The diagnosis, or UNKNOWN where what it names does not help held-out windows with 95 %.
 
     Where fewer than two windows were held out, nothing is refused.
     """
