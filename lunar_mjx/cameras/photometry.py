@@ -165,10 +165,11 @@ class Film:
         if self.exposure is not None:
             return self.exposure
         # A camera that exposed for a set Sun would show noise.
-        mu0 = jnp.maximum(sun_height, _LOWEST_SUN)
+        mu0 = jnp.maximum(sun_height, LOWEST_SUN)
         # across the light, the cosine between viewer and light is the product of their heights
         return self.mid / soil.radiance_factor(mu0, _METERED, mu0 * _METERED)
 
 
-_LOWEST_SUN = math.sin(math.radians(2.0))
+LOWEST_SUN = math.sin(math.radians(2.0))
+"""Sine of the elevation below which no exposure makes up for the Sun."""
 _METERED = math.sin(math.radians(20.0))

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from lunar_mjx.cameras.mount import front_mount
-from lunar_mjx.cameras.photometry import ROCK_BRIGHTNESS, Film
+from lunar_mjx.cameras.photometry import LOWEST_SUN, ROCK_BRIGHTNESS, Film
 from lunar_mjx.cameras.pinhole import Pose
 from lunar_mjx.cameras.texture import ALBEDO, Track, TrackPainter, regolith
 from lunar_mjx.errors import bad_input
@@ -74,8 +74,8 @@ class Sun:
 
     @property
     def exposure(self) -> float:
-        """Brightness of the light, by which level ground looks alike down to a Sun 10 deg high, as a camera exposes."""
-        return LEVEL_LIGHT / max(math.sin(math.radians(self.elevation_deg)), 0.17)
+        """Brightness of the light, by which level ground looks alike down to the lowest Sun that `Film` exposes for."""
+        return LEVEL_LIGHT / max(math.sin(math.radians(self.elevation_deg)), LOWEST_SUN)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -83,7 +83,7 @@ def rover_scene(model: Model, sun: Sun) -> dict[str, Any]:
         "tracks": {"rut": SOIL_TEXTURE.rut / 255.0, "print": SOIL_TEXTURE.print / 255.0},
         "size": float(2.0 * np.abs(rover.chassis_points).max()),
         "sun": sun.direction.tolist(),
-        # Level soil comes out at the film's `mid`, as in the other cameras; a Sun below 10 deg is not made up for.
+        # Level soil comes out at `mid` of the film down to the lowest Sun that it exposes for, as in the other cameras.
         "light": {
             "exposure": (1.0 - PAGE_LIGHT.thrown) * level * sun.exposure / LEVEL_LIGHT,
             "fill": PAGE_LIGHT.thrown * level,

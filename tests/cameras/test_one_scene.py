@@ -48,15 +48,19 @@ def in_jax(terrain: Terrain, pose: Pose, sun: Sun, **more: object) -> Pictures:
     return jax.tree.map(np.asarray, draw(*given))
 
 
-@pytest.fixture(scope="module")
-def both(opengl: tuple[str, ...], plain: Terrain) -> tuple[Pose, Images, Pictures]:
+def seen_by_both(opengl: tuple[str, ...], plain: Terrain, sun: Sun) -> tuple[Pose, Images, Pictures]:
     pose = look_at((0.0, 0.0, 5.0), (30.0, 0.0, 0.0))
-    with RoverCamera(load_rover("luvmi_x"), plain, camera=EYE, sun=SUN, largest=(160, 120), backends=opengl) as camera:
+    with RoverCamera(load_rover("luvmi_x"), plain, camera=EYE, sun=sun, largest=(160, 120), backends=opengl) as camera:
         qpos = camera.model.qpos0.copy()
         qpos[:3] = -3.0, 0.0, 0.3
         camera.place(qpos)
         images = camera.take(pose)
-    return pose, images, in_jax(plain, pose, SUN)
+    return pose, images, in_jax(plain, pose, sun)
+
+
+@pytest.fixture(scope="module")
+def both(opengl: tuple[str, ...], plain: Terrain) -> tuple[Pose, Images, Pictures]:
+    return seen_by_both(opengl, plain, SUN)
 
 
 @pytest.fixture
@@ -93,6 +97,17 @@ def test_ground_and_rocks_are_as_bright_in_both(both) -> None:
         a = np.median(drawn.rgba[..., 0][drawn.segmentation == kind]) / 255.0
         b = np.median(found.rgb[..., 0][found.label == kind])
         assert a == pytest.approx(b, rel=0.2)
+
+
+@pytest.mark.parametrize("elevation_deg", [6.0, 2.0])
+def test_both_expose_a_low_sun_alike(opengl: tuple[str, ...], plain: Terrain, elevation_deg: float) -> None:
+    _, drawn, found = seen_by_both(opengl, plain, Sun(180.0, elevation_deg))
+    red, levels = drawn.rgba[..., 0] / 255.0, {}
+    for name, colour, label in (("gl", red, drawn.segmentation), ("jax", found.rgb[..., 0], found.label)):
+        # of a rock half is dark at any exposure, and its Sun's side burns out
+        levels[name] = np.median(colour[label == GROUND]), np.mean(colour[label == ROCK] > 0.3)
+    assert levels["gl"][0] == pytest.approx(levels["jax"][0], rel=0.15)
+    assert levels["gl"][1] == pytest.approx(levels["jax"][1], abs=0.1)
 
 
 def test_tracks_lie_at_the_same_place_in_both(opengl: tuple[str, ...]) -> None:
