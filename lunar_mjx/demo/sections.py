@@ -61,11 +61,11 @@ def verdict(drives: Sequence[Drive], cases: Sequence[Case]) -> list[str]:
     return [
         f"{count} rovers drove {drives[0].time[-1]:.0f} s on true-scale terrain: {drove}. "
         f"{bad or 'None'} failed numerically, {upset or 'none'} rolled over.",
-        "A model as good as a repeated measurement would be off by about 1 scatter of single runs. With nominal soil, "
-        f"the equations of the seed paper are off by {paper.comparison.overall:.0f}, the corrected equations by "
-        f"{plain.comparison.overall:.0f}.",
-        f"With the soil refitted at {_angles(SOIL_FIT.fit_angles)}, the corrected equations are off by "
-        f"{fitted.fit.held_out:.1f} at slip angles that the fit did not see, most of it in the "
+        "Errors of the wheel are counted in the scatter of single runs: 1 is as good as measuring twice. The equations "
+        f"of the paper that this simulator began from (the seed paper) are off by {paper.comparison.overall:.0f}, the "
+        f"same with its flaws corrected by {plain.comparison.overall:.0f}.",
+        f"With the soil fitted to wheels that point {_angles(SOIL_FIT.fit_angles)} away from where they go (the slip "
+        f"angle), {fitted.fit.held_out:.1f} is left at angles that the fit did not see, most of it in the "
         f"{QUANTITIES[quantity][2]}: physics is missing, not only parameters.",
     ]
 

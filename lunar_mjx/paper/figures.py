@@ -18,8 +18,11 @@ from lunar_mjx.paper import hot_motor, slope_runs, soft_ground
 from lunar_mjx.report.style import BLUE, GREEN, INK, MUTED, VERMILION, save_light_and_dark, styled
 
 PRESET_NAMES = ("paper", "consistent")
-SLOPES_DEG = (0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 22.5, 25.0)
-"""Slopes that VIPER drives up, deg; closer from 10 deg on, where its slip rises fast."""
+SLOPES_DEG = (0.0, 5.0, 10.0, 12.5, 15.0, 17.5, 20.0, 20.5, 21.0, 21.5, 22.0, 22.5, 25.0)
+"""Slopes that VIPER drives up, deg; closer where its slip rises fast, and closest about the stall.
+
+A line from a slope that it climbs to one on which it slides back tells how fast it slides, and not where it stalls.
+"""
 STALL_SLIP = 0.95
 """Slip of the whole rover at which it is called stalled."""
 

@@ -104,12 +104,15 @@ class Section(NamedTuple):
     blocks: Sequence[Block]
 
 
-_CONFIG = {
+PLOT_CONFIG = {
     "displaylogo": False,
     "responsive": True,
     "showLink": False,
-    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"],
+    # what is looked at stays on this machine: no button sends a chart to Plotly's servers, and none of them is known
+    "plotlyServerURL": "",
+    "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d", "sendChartToCloud"],
 }
+"""How figures of pages are worked with."""
 
 
 def _script() -> str:
@@ -156,7 +159,7 @@ def write_page(
         verdict=verdict,
         sections=shown,
         figures=figures,
-        config=_json(json.dumps(_CONFIG)),
+        config=_json(json.dumps(PLOT_CONFIG)),
         dark=_json(json.dumps(DARK_FIGURES)),
         plotly=_script(),
     )

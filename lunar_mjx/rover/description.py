@@ -24,6 +24,16 @@ MODES = ("position", "velocity", "torque", "current")
 MOTOR_KEYS = ("torque_constant_Nm_A", "resistance_ohm", "current_limit_A")
 WINDINGS = (12, 18, 24, 36, 48)  # nominal voltages of the maxon ECX TORQUE 22 XL
 
+CORNER_WORDS = {
+    "lf": "left front",
+    "rf": "right front",
+    "lm": "left middle",
+    "rm": "right middle",
+    "lr": "left rear",
+    "rr": "right rear",
+}
+"""Corners of a rover in words."""
+
 
 @dataclass(frozen=True)
 class GroupDescription:

@@ -11,7 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lunar_mjx.cameras.ground_map import MAP_COLOURS, GroundMap
 from lunar_mjx.report.style import MUTED
-from lunar_mjx.visual.plots import CORNER_WORDS, WHEEL_STYLES, bounds
+from lunar_mjx.rover.description import CORNER_WORDS
+from lunar_mjx.visual.plots import WHEEL_STYLES, bounds
 from lunar_mjx.visual.recorded import RecordedDrive
 
 

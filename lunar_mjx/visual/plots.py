@@ -32,6 +32,7 @@ from lunar_mjx.report.style import (
     save_light_and_dark,
     styled,
 )
+from lunar_mjx.rover.description import CORNER_WORDS
 from lunar_mjx.terrain import Terrain, surface
 from lunar_mjx.visual.recorded import RecordedDrive
 
@@ -44,16 +45,6 @@ WHEEL_STYLES = {
     "rm": (ORANGE, ":"),
 }
 """Sides by colour, front, middle and rear by the line: legible without colour."""
-
-CORNER_WORDS = {
-    "lf": "left front",
-    "rf": "right front",
-    "lm": "left middle",
-    "rm": "right middle",
-    "lr": "left rear",
-    "rr": "right rear",
-}
-"""Corners of a rover in words."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +60,10 @@ class PlotLayout:
     """Least height of a map over its width: a straight drive shows some ground beside it."""
     least_contrast: float = 0.08
     """Least range of shades that a relief is stretched from: even ground stays even."""
+    least_rise: float = 0.1
+    """Least range of heights, m: a wheel feels no millimetre, and a plane shows none."""
+    least_slope: float = 2.0
+    """Least range of slopes, deg, for the same reason."""
 
 
 LAYOUT = PlotLayout()
@@ -203,11 +198,19 @@ def _profile(axes: Axes, drive: RecordedDrive) -> None:
     x, y = drive.position[:, 0], drive.position[:, 1]
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     height = np.asarray(surface(drive.model.terrain, x, y), float)
-    axes.fill_between(
-        way, height, height.min() - 0.05 * max(np.ptp(height), 0.02), color=MUTED, alpha=0.35, linewidth=0
-    )
     axes.plot(way, height, color=INK, linewidth=1.2)
+    _at_least(axes, LAYOUT.least_rise)
+    bottom = axes.get_ylim()[0]
+    axes.fill_between(way, height, bottom, color=MUTED, alpha=0.35, linewidth=0)
+    axes.set_ylim(bottom=bottom)
     style(axes, "ground, m", "along the path, m")
+
+
+def _at_least(axes: Axes, span: float) -> None:
+    """Widens an axis of heights to a span: of what is level, rounding errors would fill it."""
+    low, high = axes.get_ylim()
+    missing = max(span - (high - low), 0.0)
+    axes.set_ylim(low - 0.5 * missing, high + 0.5 * missing)
 
 
 def _outline(drive: RecordedDrive, row: int) -> np.ndarray:
@@ -257,6 +260,7 @@ def _slope(axes: Axes, drive: RecordedDrive) -> None:
     along, across = drive.slope.T
     axes.plot(drive.time, along, color=INK, label="along the heading")
     axes.plot(drive.time, across, color=GREEN, linestyle="--", label="across (up to the left)")
+    _at_least(axes, LAYOUT.least_slope)
     style(axes, "slope, °")
     _legend_above(axes, fontsize=7, ncols=2)
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image
 
 from lunar_mjx.cameras import Sun
 from lunar_mjx.cameras.relief import relief
 from lunar_mjx.errors import UserError
 from lunar_mjx.terrain import load_terrain
-from lunar_mjx.visual import encode
+from lunar_mjx.visual import encode, plots
 from lunar_mjx.visual.overlay import MapInset, Overlay, dashes
 from lunar_mjx.visual.plots import drive_summary, terrain_preview
 from lunar_mjx.visual.recorded import read_drive
@@ -46,6 +48,16 @@ def test_legends_hide_no_line(luvmi):
         legend = axes.get_legend().get_window_extent()
         assert legend.y0 >= axes.bbox.y1 - 1.0
         assert not any(legend.overlaps(other.bbox) for other in figure.axes)
+
+
+def test_level_ground_is_not_stretched_to_fill_its_axes(luvmi):
+    drive = read_drive(luvmi[0])
+    level = dataclasses.replace(drive, model=dataclasses.replace(drive.model, terrain=load_terrain("flat")))
+    figure = Figure()
+    for draw, least in ((plots._profile, plots.LAYOUT.least_rise), (plots._slope, plots.LAYOUT.least_slope)):
+        axes = figure.add_subplot()
+        draw(axes, level)
+        assert np.ptp(axes.get_ylim()) > 0.999 * least
 
 
 def test_terrain_preview(run, tmp_path):

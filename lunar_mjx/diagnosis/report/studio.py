@@ -24,7 +24,7 @@ from lunar_mjx.diagnosis.report.words import SPLIT_NAMES, and_list, channel_labe
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
 from lunar_mjx.files import write_text
-from lunar_mjx.report.page import packed
+from lunar_mjx.report.page import PLOT_CONFIG, packed
 from lunar_mjx.report.style import BLUE, DARK_FIGURES, FONT, INK, MUTED, ORANGE, PAPER, RULE, SHADES
 
 
@@ -152,6 +152,7 @@ def _page_data(result: Result, traces: Traces) -> dict[str, Any]:
     return {
         "table": traces.is_table,
         "style": _STYLE,
+        "config": PLOT_CONFIG,
         "channels": [channel_label(c)[:60] for c in channels],
         "many": len(channels) > STUDIO_SIZES.most_rows,
         "kinds": _kinds(channels, [[0.0 if at is None else _rms(residual[at]) or 0.0 for at in line] for line in grid]),

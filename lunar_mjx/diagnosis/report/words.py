@@ -9,6 +9,7 @@ from typing import Any
 
 from lunar_mjx.diagnosis.unknown_inputs.inputs import PROBES
 from lunar_mjx.logs.schema import STEADY_CHANNELS, find_channel, parse_name
+from lunar_mjx.rover.description import CORNER_WORDS
 
 SPLIT_NAMES = {
     "fit": "fitted",
@@ -54,7 +55,9 @@ def channel_label(channel: str) -> str:
     if channel_entry is None:
         return channel.replace("_", " ")
     kind, match = channel_entry
-    return _with_unit(match[0], kind.unit)
+    corner = match.groupdict().get("corner") or ""
+    name = match[0].replace(f"_{corner}_", f"_{CORNER_WORDS.get(corner, corner)}_", 1) if corner else match[0]
+    return _with_unit(name, kind.unit)
 
 
 def kind_label(channel: str) -> str:

@@ -239,7 +239,7 @@ function numbers([low, step, rows]) {
 }
 const axes = () => ({gridcolor: of(data.style.rule), linecolor: of(data.style.muted), zeroline: false, ticks: "outside", tickcolor: of(data.style.rule)});
 const figure = () => ({paper_bgcolor: of(data.style.paper), plot_bgcolor: of(data.style.paper), font: {family: data.style.font, size: 13, color: of(data.style.ink)}, hovermode: "closest"});
-const config = () => ({displaylogo: false, responsive: true, displayModeBar: innerWidth > 820 ? "hover" : false, showLink: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]});
+const config = () => ({...data.config, displayModeBar: innerWidth > 820 ? "hover" : false});
 function showPanel() {
   const panel = data.panels[row][column], s = data.style;
   const [x] = numbers(panel.x), values = numbers(panel.values), residual = numbers(panel.residual);
@@ -287,7 +287,7 @@ function showMap() {
       colorbar: {title: {text: "sigma"}, tickvals: [0, 0.30103, 0.69897, 1, 1.30103, 2], ticktext: ["1", "2", "5", "10", "20", "100"], thickness: 12}}};
   const square = map.equal ? {scaleanchor: "x", scaleratio: 1} : {};
   Plotly.react("place", [points], Object.assign(figure(), {
-    margin: {l: 62, r: 10, t: 44, b: 46}, title: {text: "where it happened: error over all channels", font: {size: 14}, x: 0, xanchor: "left"},
+    margin: {l: 62, r: 10, t: 44, b: 46}, title: {text: "where: error over all channels", font: {size: 14}, x: 0, xanchor: "left"},
     xaxis: Object.assign({title: {text: map.x_title}}, axis), yaxis: Object.assign({title: {text: map.y_title}}, axis, square)}), config());
   place.setAttribute("aria-label", "Error by place; " + data.units[column].name + " is drawn larger");
 }

@@ -43,7 +43,7 @@ def test_every_channel_of_every_manoeuvre_has_a_panel_and_the_worst_comes_first(
     (block,) = explore.panels(chain([result]))
     assert len(block.panels) == 4
     first = next(iter(block.panels.values()))
-    assert first["label"] == "motor lf drive current, A: climb"
+    assert first["label"] == "motor left front drive current, A: climb"
     measured, refitted, improved, left, less = first["y"]
     np.testing.assert_allclose(measured, 0.0)
     np.testing.assert_allclose(left, result.traces.residual[1, 180:], rtol=1e-4, atol=1e-4)
@@ -81,7 +81,7 @@ def test_names_from_files_are_no_markup_in_figures(result):
 def test_of_many_channels_the_worst_have_rows_and_all_are_in_the_list(result, monkeypatch):
     monkeypatch.setattr(explore, "EXPLORE", dataclasses.replace(explore.EXPLORE, channels=1))
     (block,) = explore.panels(chain([result]))
-    assert [list(heat.y) for heat in block.figure.data] == [["motor lf drive current, A"]] * 3
+    assert [list(heat.y) for heat in block.figure.data] == [["motor left front drive current, A"]] * 3
     assert len(block.panels) == 4 and "Of 2 channels" in block.caption
 
 

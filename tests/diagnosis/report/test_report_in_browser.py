@@ -58,6 +58,9 @@ def test_by_mouse_and_by_keyboard(page: Path, browser: Browser) -> None:
     browser.wait("document.querySelector('details').open")
     assert browser.value("document.title") != "1" and browser.value("document.images.length") == 0
     assert browser.asked() == [page.as_uri()]
+    # nor does a button send a figure anywhere
+    buttons = browser.value("[...document.querySelectorAll('.modebar-btn')].map(button => button.dataset.title)")
+    assert "Pan" in buttons and not any("hare" in title or "loud" in title for title in buttons)
     assert not browser.problems
 
 

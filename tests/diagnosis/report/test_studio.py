@@ -18,6 +18,7 @@ from lunar_mjx.diagnosis.report.reasons import reason
 from lunar_mjx.diagnosis.report.steps import chain, judged
 from lunar_mjx.errors import UserError
 from lunar_mjx.report.style import BLUE, DARK_FIGURES, DARK_SHADES, SHADES
+from lunar_mjx.rover.description import CORNER_WORDS
 
 
 def page_data(folder: Path) -> dict:
@@ -146,7 +147,7 @@ def test_of_many_channels_every_kind_has_a_row_the_worst_first(tmp_path):
     kinds = {k["name"]: k["rows"] for k in data["kinds"]}
     assert len(kinds) == 28 and sorted(r for rows in kinds.values() for r in rows) == list(range(95))
     names = {k: [data["channels"][r] for r in rows] for k, rows in kinds.items()}
-    assert set(names["motor drive current, A"]) == {f"motor {c} drive current, A" for c in CORNERS}
+    assert set(names["motor drive current, A"]) == {f"motor {CORNER_WORDS[c]} drive current, A" for c in CORNERS}
     assert set(names["gyro, rad/s"]) == {f"gyro {x}, rad/s" for x in "xyz"} and len(names["quaternion"]) == 4
     worst = [max(data["models"][data["base"]]["cells"][r]) for rows in kinds.values() for r in rows[:1]]
     assert worst == sorted(worst, reverse=True) and all(max(line) <= worst[0] for line in data["models"][1]["cells"])
@@ -254,6 +255,8 @@ def test_by_hand_in_a_browser(tmp_path, browser, table):
     browser.resize(360, 740)
     browser.wait("innerWidth === 360 && document.documentElement.scrollWidth <= 360")
     assert browser.value("document.title") == "Studio: run" and browser.value("document.images.length") == 0
+    buttons = browser.value("[...document.querySelectorAll('.modebar-btn')].map(button => button.dataset.title)")
+    assert "Pan" in buttons and not any("hare" in title or "loud" in title for title in buttons)
     assert browser.requests == [page.as_uri()]
     assert not browser.problems
 
@@ -292,7 +295,7 @@ def test_95_channels_of_eight_drives_by_hand(tmp_path, browser):
     assert browser.value("Math.max(...document.getElementById('traces').data.at(-2).y)") > 75.0
     box = "document.getElementById('filter')"
     find = f"{box}.value = '{{}}'; {box}.dispatchEvent(new Event('input'))"
-    browser.value(find.format("LF current"))
+    browser.value(find.format("LEFT front current"))
     assert browser.value(shown) == 3 and "3 of 95" in browser.value("document.getElementById('found').textContent")
     browser.value(find.format("no such channel"))
     assert browser.value(shown) == 0
