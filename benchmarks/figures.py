@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RECORDS, FIGURES = ROOT / "benchmarks", ROOT / "docs" / "figures"
 sys.path.insert(0, str(RECORDS))  # scripts import what lies beside them
 
+REAL_DRIVES = ("real_cuadriga", "real_poses", "real_snow")
 LEARNING = ("large_luvmi_x", "rates", "realism", "brax", "paper")
 
 
@@ -42,6 +43,12 @@ def _real_wheel() -> None:
     real_wheel.draw(_read("real_wheel")["rows"])
 
 
+def _real_drive(name: str) -> Callable[[], Any]:
+    from benchmarks import real_drives
+
+    return lambda: real_drives.picture(real_drives.kept_lines(name), FIGURES / f"{name}.png")
+
+
 def _learning(name: str) -> Callable[[], Any]:
     script = RECORDS / "rl" / "figures.py"  # which imports what lies beside it
     command = [sys.executable, str(script), str(RECORDS / "rl" / f"{name}.json"), "--out", str(FIGURES)]
@@ -52,6 +59,7 @@ DRAWN: Mapping[str, Callable[[], Any]] = {
     "backends": _backends,
     "hidden_effects": _hidden_effects,
     "real_wheel": _real_wheel,
+    **{name: _real_drive(name) for name in REAL_DRIVES},
     **{f"rl_{name}": _learning(name) for name in LEARNING},
 }
 

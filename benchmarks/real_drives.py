@@ -590,6 +590,8 @@ def write_page(page: Path, result: Mapping[str, Any]) -> None:
     page.write_text(f"{before}{BEGIN}\n{page_table(result)}\n\n{END}{after}", encoding="utf-8")
 
 
+DRAWN = Path(__file__).with_name("real_drives_drawn.npz")
+"""What the pages' pictures of held-out windows show, since their runs are not kept."""
 SHOWN = {
     "motor_left_drive_current_A": "current of the left motor, A",
     "motor_right_drive_current_A": "current of the right motor, A",
@@ -609,16 +611,12 @@ def apart(values: np.ndarray, windows: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.append(values[window], np.nan) for window in windows if len(window)])
 
 
-def picture(runs: Sequence[Path], file: Path) -> None:
-    """Draws held-out windows, one after another: measured, the model as given and refitted, and a later run's refit.
+def lines_of(runs: Sequence[Path]) -> dict[str, np.ndarray]:
+    """What a picture of held-out windows shows, by `CHANNEL/LABEL`: one value for each sample, NaN between windows.
 
     Args:
-      runs: a folder of `compare`, and maybe one of `add` on it. file: image to write.
+      runs: a folder of `compare`, and maybe one of `add` on it.
     """
-    from matplotlib.figure import Figure
-
-    from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, save_light_and_dark, styled
-
     stored = []
     for run in runs[:2]:
         with np.load(run / "series.npz") as data:
@@ -626,30 +624,68 @@ def picture(runs: Sequence[Path], file: Path) -> None:
     first = stored[0]
     held = np.isin(first["split"][first["unit"]], ("test", "select"))
     stops = [*first["series_start"][1:], len(first["measured"])]
-    channels = [c for c in SHOWN if c in first["series_channel"]]
+    lines = {"as given": first["predicted"][0], "refitted": first["predicted"][1]}
+    if len(stored) > 1:
+        added = json.loads((runs[1] / "run.json").read_text(encoding="utf-8"))["added"]
+        lines[f"with {', '.join(added)}"] = stored[1]["predicted"][1]
+    lines["measured"] = first["measured"]
+    out = {}
+    for channel in (c for c in SHOWN if c in first["series_channel"]):
+        parts = [
+            part
+            for a, b, c in zip(first["series_start"], stops, first["series_channel"], strict=True)
+            if c == channel
+            for part in joined(np.arange(a, b)[held[a:b]], first["time"])
+        ]
+        out |= {f"{channel}/{label}": apart(values, parts).astype(np.float32) for label, values in lines.items()}
+    return out
+
+
+def picture(lines: Mapping[str, np.ndarray], file: Path) -> None:
+    """Draws held-out windows, one after another: measured, the model as given and refitted, and a later run's refit.
+
+    Args:
+      lines: see `lines_of`. file: light image to write; a dark one comes to lie beside it.
+    """
+    from matplotlib.figure import Figure
+
+    from lunar_mjx.report.style import BLUE, INK, MUTED, ORANGE, save_light_and_dark, styled
+
+    looks = {"as given": (MUTED, ":"), "refitted": (ORANGE, "--")}
+    channels = list(dict.fromkeys(name.partition("/")[0] for name in lines))
     with styled():
         figure = Figure(figsize=(8.0, 2.0 * len(channels)), layout="constrained")
-        for k, (axes, channel) in enumerate(
-            zip(figure.subplots(len(channels), squeeze=False)[:, 0], channels, strict=True)
-        ):
-            parts = [
-                part
-                for a, b, c in zip(first["series_start"], stops, first["series_channel"], strict=True)
-                if c == channel
-                for part in joined(np.arange(a, b)[held[a:b]], first["time"])
-            ]
-            lines = [("as given", first["predicted"][0], MUTED, ":"), ("refitted", first["predicted"][1], ORANGE, "--")]
-            if len(stored) > 1:
-                added = json.loads((runs[1] / "run.json").read_text(encoding="utf-8"))["added"]
-                lines.append((f"with {', '.join(added)}", stored[1]["predicted"][1], BLUE, "-"))
-            for label, values, colour, line in lines:
-                axes.plot(apart(values, parts), color=colour, linestyle=line, linewidth=1.2, label=label)
-            axes.plot(apart(first["measured"], parts), ".", color=INK, markersize=2.5, label="measured")
+        every = figure.subplots(len(channels), squeeze=False)[:, 0]
+        for axes, channel in zip(every, channels, strict=True):
+            for name, values in lines.items():
+                label = name.partition("/")[2]
+                if not name.startswith(f"{channel}/"):
+                    continue
+                if label == "measured":
+                    axes.plot(values, ".", color=INK, markersize=2.5, label=label)
+                else:
+                    colour, line = looks.get(label, (BLUE, "-"))
+                    axes.plot(values, color=colour, linestyle=line, linewidth=1.2, label=label.replace("_", " "))
             axes.set_ylabel(SHOWN[channel], fontsize=8)
-            if k == 0:
-                axes.legend(frameon=False, ncols=4, fontsize=8)
+        # above the axes, where it hides no sample
+        every[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), frameon=False, ncols=4, fontsize=8)
         figure.supxlabel("samples of held-out windows, one after another, with a gap between them", fontsize=9)
         save_light_and_dark(figure, file, dpi=110)
+
+
+def kept_lines(name: str) -> dict[str, np.ndarray]:
+    """The lines of a picture of the pages, by its name without an ending."""
+    with np.load(DRAWN) as kept:
+        return {k.removeprefix(f"{name}/"): kept[k] for k in kept.files if k.startswith(f"{name}/")}
+
+
+def keep_lines(name: str, lines: Mapping[str, np.ndarray]) -> None:
+    """Keeps the lines of a picture of the pages, beside those of others: their runs would be too large."""
+    others = {}
+    if DRAWN.exists():
+        with np.load(DRAWN) as kept:
+            others = {k: kept[k] for k in kept.files if not k.startswith(f"{name}/")}
+    np.savez_compressed(DRAWN, **others, **{f"{name}/{k}": v for k, v in lines.items()})
 
 
 def run_all(args: argparse.Namespace) -> None:
@@ -743,9 +779,13 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="write what OUT holds into this page, and run nothing")
     parser.add_argument("--picture", type=Path, help="draw the runs named in --of into this image, and run nothing")
     parser.add_argument("--of", type=Path, action="append", default=[], help="run folder to draw")
+    parser.add_argument("--keep", action="store_true", help="keep its lines, from which benchmarks.figures draws")
     args = parser.parse_args()
     if args.picture:
-        picture(args.of, args.picture)
+        lines = lines_of(args.of)
+        picture(lines, args.picture)
+        if args.keep:
+            keep_lines(args.picture.stem, lines)
         return
     if args.page:
         result = json.loads(args.out.read_text())

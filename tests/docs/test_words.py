@@ -95,10 +95,6 @@ LIGHT_ALONE = frozenset(
         "view_web.png",
         # a film that is light, of the README's own runs
         "error_falls.gif",
-        # of runs that no record keeps
-        "real_cuadriga.png",
-        "real_poses.png",
-        "real_snow.png",
         # SVG that holds both
         "rooms.svg",
     }
