@@ -234,6 +234,23 @@ def test_the_page_shows_dust_of_the_time_that_it_shows(dusty, browser):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("size", [(360, 740), (740, 360)], ids=["phone", "phone, lying"])
+def test_a_phone_shows_the_panels_of_a_replay_whole(served, browser, size):
+    browser.resize(*size)
+    browser.open(served.address)
+    browser.wait("Number(document.body?.dataset.time) > 0.1")
+    boxes = browser.value(
+        "[...document.querySelectorAll('#pad, #pad button, #replay')].map(s => s.getBoundingClientRect())"
+        ".filter(b => b.width).map(b => [b.left, b.top, b.right, b.bottom, b.height])"
+    )
+    assert len(boxes) > 3
+    for left, top, right, bottom, _ in boxes:
+        assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
+    assert browser.value("[...document.querySelectorAll('#pad button')].every(b => b.scrollHeight <= b.clientHeight)")
+    assert not browser.problems
+
+
+@pytest.mark.slow
 def test_the_page_plays_chooses_and_seeks(served, browser, tmp_path):
     """What plays by the clock is paused before it is read, so that a slow machine sees the same page."""
     seek = "const s = document.getElementById('when'); s.value = {}; s.dispatchEvent(new Event('input'));"
