@@ -47,7 +47,8 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
     sections.append(Section("Provenance", tables.provenance(results)))
     # A campaign of thirty drives would make a paragraph of the title.
     logs = list(dict.fromkeys(Path(p).name for p in results[-1].run.get("logs") or []))
-    title = f"Criticism of a model: {and_list(logs[:4])}" + (f" and {len(logs) - 4} more" if len(logs) > 4 else "")
+    named = logs if len(logs) <= 4 else [*logs[:4], f"{len(logs) - 4} more"]
+    title = f"Criticism of a model: {and_list(named)}"
     shown_sections = [s for s in sections if s.blocks]
     return write_page(Path(out), title, _verdict(judge, steps), shown_sections, lead(results, judge))
 

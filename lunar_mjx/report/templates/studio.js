@@ -41,6 +41,7 @@ function drawProbabilities() {
   const box = $("probabilities");
   if (!data.hypotheses.length) {
     add(box, "p", "Probabilities are not known yet: lunar-mjx why finds them.", "note");
+    $("how").hidden = !data.effects.length;  // nothing to choose from
     return;
   }
   const stack = add(box, "div");

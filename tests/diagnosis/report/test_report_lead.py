@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shlex
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,12 +11,13 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from small_run import write_run
 
 from lunar_mjx.diagnosis.report import figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
 from lunar_mjx.diagnosis.report.read import Result
 from lunar_mjx.diagnosis.report.steps import Error
-from lunar_mjx.diagnosis.report.write import _audit_line, _verdict
+from lunar_mjx.diagnosis.report.write import _audit_line, _verdict, write_report
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import parameter_table
 from lunar_mjx.inference.coordinates import FACTOR_UNIT, NUISANCE, Coordinate
@@ -267,3 +269,12 @@ def test_starts_and_instruments_have_a_table_of_their_own():
     own, instruments = tables.parameters(run, run)
     assert [row[0] for row in own.rows] == ["drag.x"] and not own.folded
     assert [row[0] for row in instruments.rows] == [f"{NUISANCE}.x"] and instruments.folded
+
+
+def test_a_campaign_of_many_drives_makes_no_paragraph_of_the_title(tmp_path):
+    folder = write_run(tmp_path / "run", table=False)
+    run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    run["logs"] = [str(tmp_path / f"drive_{k}") for k in range(9)]
+    (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
+    page = write_report([folder], tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<h1>Criticism of a model: drive_0, drive_1, drive_2, drive_3 and 5 more</h1>" in page

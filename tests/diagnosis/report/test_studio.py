@@ -313,3 +313,15 @@ def test_95_channels_of_eight_drives_by_hand(tmp_path, browser):
     assert browser.collisions() == []
     assert browser.requests == [page.as_uri()]
     assert not browser.problems
+
+
+@pytest.mark.slow
+def test_a_run_that_nobody_asked_why_offers_no_choice_of_effects(tmp_path, browser):
+    folder = write_run(tmp_path / "run", table=True)
+    for kept in ("verdict.json", "next.json", "refits.npz", "signatures.npz"):
+        (folder / kept).unlink(missing_ok=True)
+    browser.open(studio.write_studio(folder, tmp_path / "studio.html").as_uri())
+    browser.wait("document.body?.dataset.ready")
+    assert "lunar-mjx why finds them" in browser.value("document.getElementById('probabilities').textContent")
+    assert browser.value("document.getElementById('how').offsetHeight") == 0
+    assert not browser.problems
