@@ -103,9 +103,19 @@ def require_file(path: str | Path, what: str) -> Path:
         raise UserError(f"{what} = {str(path)[:60]!r}... is no path; give the path of a file.")
     if path.is_dir():
         raise UserError(f"{path}: {what} is a folder, not a file; give the path of the file itself.")
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path}: {what} is a device, a pipe or a socket; give the path of a file.")
+    if path.is_symlink() and not path.exists():
+        raise UserError(f"{path}: {what} is a link that leads to no file; mend the link, or give the file itself.")
     if not path.is_file():
         raise UserError(f"{path}: {what} is not there; check the path or its spelling.")
     return path
+
+
+def no_archive(error: Exception) -> str:
+    """Why NumPy reads no archive, in its words on one line; but not its advice to load what may run code."""
+    text = one_line(error) or type(error).__name__
+    return "it is no archive of arrays" if "pickle" in text else text
 
 
 def one_line(error: object) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from lunar_mjx.errors import UserError
 
@@ -15,15 +17,16 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """Gives a path to write to, which takes the place of `path` when the block has ended well.
 
     It lies in the same folder and has the same suffix, from which libraries take the format. A block that fails, or a
-    process that is killed, leaves `path` as it was.
+    process that is killed, leaves `path` as it was. A link stays one: the file that it leads to is replaced.
 
     Raises:
-      UserError: the operating system refuses: no such folder, no permission, disk full; or `path` is a folder by its
-        name alone, such as / or nothing.
+      UserError: the operating system refuses: no such folder, no permission, disk full; `path` is a folder by its name
+        alone, such as / or nothing; or there is something else than a file, such as a device.
     """
     path = Path(path)
     if not path.name:
         raise UserError(f"{path}: is a folder and no file; name a file in it, as in {path / 'out'}.")
+    path = _place(path)
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         try:
@@ -36,6 +39,23 @@ def replacing(path: str | Path) -> Iterator[Path]:
                 part.unlink(missing_ok=True)
     except OSError as error:
         raise _refused(path, error) from error
+
+
+def _place(path: Path) -> Path:
+    """Where a file lies that `path` names; links are followed."""
+    if path.is_symlink():
+        try:
+            path = path.resolve()
+        except (OSError, RuntimeError):  # of Python 3.13, and before
+            raise UserError(f"{path}: is a link that leads to itself; name a file.") from None
+    try:
+        kind = path.stat().st_mode
+    except OSError:  # nothing is there, or it is told when it is written
+        return path
+    if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+        # To be renamed over would end a device (/dev/null) or a pipe for all other processes.
+        raise UserError(f"{path}: is a device, a pipe or a socket and no file; name a file.")
+    return path
 
 
 @contextmanager
@@ -62,6 +82,20 @@ def _refused(path: Path, error: OSError) -> UserError:
         f"{path}: cannot be written ({error.strerror or error}); name a folder that exists, with room and permission "
         "to write."
     )
+
+
+def no_key_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON as a dict; for `object_pairs_hook` of `json.loads`, which else keeps the last of two alike.
+
+    Raises:
+      ValueError: a key stands there twice.
+    """
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"the key {key[:60]!r} stands there twice")
+        found[key] = value
+    return found
 
 
 def write_text(path: str | Path, text: str) -> Path:

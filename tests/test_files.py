@@ -7,6 +7,7 @@ import contextlib
 import importlib.util
 import itertools
 import json
+import os
 import random
 import re
 import resource
@@ -28,8 +29,8 @@ from lunar_mjx.agents.curves import plot_progress
 from lunar_mjx.agents.policy import Policy, save_policy
 from lunar_mjx.agents.record import Record
 from lunar_mjx.diagnosis.runs import save_json
-from lunar_mjx.errors import UserError
-from lunar_mjx.files import appending, replacing
+from lunar_mjx.errors import UserError, require_file
+from lunar_mjx.files import appending, replacing, write_text
 from lunar_mjx.logs.recorder.particle_bed import write_particle_log
 from lunar_mjx.logs.seal import Answer, write_answer
 from lunar_mjx.logs.write import write_frame, write_log
@@ -295,6 +296,47 @@ def test_the_command_tells_a_full_disk_in_one_sentence(run, tmp_path):
         result = run("preset", "consistent", "--rover", "luvmi_x", "--save", out)
     assert result.status == 2 and "model.toml: cannot be written" in result.err and "Traceback" not in result.err
     assert out.read_text() == "old"
+
+
+def test_a_link_stays_one_and_its_file_is_replaced(tmp_path):
+    file, link, nowhere, loop = (tmp_path / name for name in ("far/a.txt", "a.txt", "b.txt", "loop"))
+    file.parent.mkdir()
+    file.write_text("old")
+    link.symlink_to(file)
+    write_text(link, "new")
+    assert link.is_symlink() and file.read_text() == "new"
+    nowhere.symlink_to(tmp_path / "far" / "b.txt")
+    write_text(nowhere, "new")
+    assert nowhere.is_symlink() and (tmp_path / "far" / "b.txt").read_text() == "new"
+    loop.symlink_to(loop)
+    with pytest.raises(UserError, match="leads to itself"):
+        write_text(loop, "new")
+
+
+def test_a_pipe_or_a_device_is_never_renamed_over(tmp_path, run):
+    """Whoever may write to /dev/null as root would else end it for every process."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="is a device, a pipe or a socket and no file"), replacing(tmp_path / "pipe"):
+        pytest.fail("nothing is written")
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    result = run("preset", "consistent", "--rover", "luvmi_x", "--save", tmp_path / "link")
+    assert result.status == 2 and "is a device, a pipe or a socket" in result.err
+    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
+
+
+def test_what_is_there_and_is_no_file_is_not_called_missing(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name, said in (
+        ("pipe", "is a device, a pipe or a socket; give the path of a file"),
+        ("link", "is a link that leads to no file"),
+        ("loop", "is a link that leads to no file"),
+        ("gone", "is not there"),
+    ):
+        with pytest.raises(UserError, match=said):
+            require_file(tmp_path / name, "the table")
 
 
 @pytest.mark.parametrize("name", ["/", ".", ""])

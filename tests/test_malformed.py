@@ -488,6 +488,9 @@ POLICIES = [
 
 def test_broken_policies(tmp_path):
     path = tmp_path / "policy.npz"
+    path.write_text("text")
+    with pytest.raises(UserError, match=r"is no policy \(it is no archive of arrays\)"):
+        load_policy(path)
     for changes in POLICIES:
         np.savez(path, record=np.array(json.dumps(_record(changes))))
         with pytest.raises(UserError) as error:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lunar_mjx.agents.networks import ACTIVATIONS, make_actor, normalised
 from lunar_mjx.envs import TASKS, NavigationConfig
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, no_archive, require_file
 from lunar_mjx.files import replacing
 from lunar_mjx.resources import shipped
 
@@ -176,7 +176,7 @@ def load_policy(path: str | Path) -> Policy:
             arrays = {name: data[name] for name in data.files if name != "record"}
         _Record.model_validate(record)
     except Exception as error:  # archives, their compression and NumPy's headers raise a dozen kinds
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = no_archive(error)[:200]
         raise UserError(f"{path}: is no policy ({reason}); give an .npz that `lunar-mjx train` wrote.") from None
     environment = record["environment"]
     if environment.get("name") == "navigation" and not {"model", "preset"} & environment["options"].keys():

@@ -164,15 +164,15 @@ def simulate(
     built = load_model(model) if model else make_model(rover, terrain, DEFAULT_PRESET if preset is None else preset)
     if gravity is not None:
         if not 0.0 < gravity < 30.0:
-            raise bad_input("simulate", "--gravity", gravity, "is no gravity that a rover meets", "give 0 to 30 m/s2")
+            raise bad_input("simulate", "--gravity", gravity, "is no gravity that a rover meets", "give 0.1 to 29 m/s2")
         built = built.replace(gravity=gravity)
     for effect in effects or []:
         built = built.add(effect, "--effects")
-    if commands and cmd_vel:
+    if commands and cmd_vel is not None:
         raise bad_input("simulate", "--cmd-vel", cmd_vel, "is given beside --commands", "give one of them")
     if commands:
         wanted = read_commands(commands, built)
-    elif cmd_vel:
+    elif cmd_vel is not None:
         wanted = cmd_vel_commands(built, cmd_vel, duration)
     else:
         wanted = front_steering(built, constant_commands(built, duration, drive=drive), steer)

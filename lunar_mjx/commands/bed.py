@@ -59,7 +59,12 @@ def simulate(
     froude: Annotated[float, typer.Option(help="square of the faster of rim and travel speed over g R")] = 0.1,
     step_share: Annotated[float, typer.Option(help="voxels that the faster of them moves in a time step")] = 0.15,
     path: Annotated[float, typer.Option(help="radii that the faster of them moves")] = 4.0,
-    controls: Annotated[int, typer.Option(help="points that are computed again to learn the numerical error")] = 4,
+    controls: Annotated[
+        int | None,
+        typer.Option(
+            help="points that are computed again to learn the numerical error; 4 if left out, or all of fewer"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of the places of the particles.")] = 0,
     seconds: Annotated[float | None, typer.Option(help="Time limit; the same command goes on later.")] = None,
     together: Annotated[int | None, typer.Option(min=1, help="Particles computed together; by the device.")] = None,
@@ -68,7 +73,7 @@ def simulate(
     """Drive a wheel through simulated sand and write a steady-state table, with its numerical error as the noise."""
     if soil != "particles":
         raise bad_input("lunar-mjx bed simulate", "--soil", soil, "does not exist", "use particles")
-    check_folder(out)
+    check_folder(out, "log.toml")
     select_device("cpu")  # JAX only reads tables here, and must not take the GPU's memory
     from lunar_mjx.logs.recorder.particle_bed import write_particle_log
     from lunar_mjx.report.progress import console_progress
@@ -92,12 +97,12 @@ def simulate(
     )
     g = _gravity(gravity, "bed simulate")
     # The whole plan first: what the folder lacks of it is what there is to do, after a stop as well.
-    runs = campaign.plan(wheel, sand, g, points, numerics, controls)
+    runs = campaign.plan(wheel, sand, g, points, numerics, min(4, len(points)) if controls is None else controls)
     if campaign.missing(runs, out):
         open_device(device)  # before anything is written
     # Points of a table keep its definition of slip, so that both tables can be laid side by side.
     definition = table.slip_definition if table else "wheel_frame"
-    folder = make_folder(out)
+    folder = make_folder(out, "log.toml")
 
     def keep(results: list[dict[str, Any]]) -> None:
         if any(r["variant"] == "table" and r["usable"] for r in results):

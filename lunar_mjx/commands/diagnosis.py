@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from lunar_mjx.commands.compiled import keep_compiled
-from lunar_mjx.commands.options import MOST_SEED
+from lunar_mjx.commands.options import MOST_SEED, check_folder, check_place
 from lunar_mjx.errors import UserError, bad_input, plain_digits
 
 if TYPE_CHECKING:
@@ -98,6 +98,7 @@ def compare(
     from lunar_mjx.report.progress import console_progress
 
     # Before the model is made and anything compiles: a mistake in an option is told within a second.
+    check_folder(out, "run.json")
     _require_imposed("--prior", prior, logs)
     _require_imposed("--fix", fix, logs)
     keep_compiled()
@@ -137,6 +138,7 @@ def why(
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
 
+    _require_room(run)
     keep_compiled()
     with console_progress() as progress:
         diagnosis = verbs.why(run, only, progress=progress, seconds=seconds, about=explain)
@@ -163,6 +165,7 @@ def next_(
     from lunar_mjx.diagnosis.next_experiment import next_experiment
     from lunar_mjx.report.progress import console_progress
 
+    _require_room(run)
     keep_compiled()
     with console_progress() as progress:
         found = next_experiment(run, between or (), seconds, progress)
@@ -178,6 +181,7 @@ def add(
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
 
+    check_folder(out, "run.json")
     keep_compiled()
     try:
         with console_progress() as progress:
@@ -200,6 +204,7 @@ def unknown(
     from lunar_mjx.diagnosis.runs import plain
     from lunar_mjx.report.progress import console_progress
 
+    _require_room(run)
     keep_compiled()
     with console_progress() as progress:
         found = discover(run, port, out, progress=progress)
@@ -262,6 +267,7 @@ def improve(
     from lunar_mjx.diagnosis import verbs
     from lunar_mjx.report.progress import console_progress
 
+    check_folder(out, "run.json")
     keep_compiled()
     with console_progress() as progress:
         diagnosis, runs = verbs.improve(
@@ -300,6 +306,8 @@ def watch(
     from lunar_mjx.diagnosis import watch as watching
     from lunar_mjx.report.progress import console_progress
 
+    if out is not None:
+        check_folder(out)
     keep_compiled()
     status = count = 0
     with console_progress() as progress:
@@ -313,6 +321,12 @@ def watch(
         print("No alarm: nothing began that is larger than what these drives do anyway.")
     # Of the last alarm, as the verdict of `why` is one: scripts branch on it.
     raise typer.Exit(status)
+
+
+def _require_room(run: Path) -> None:
+    """Refuses, before minutes of work, a run folder that takes no result; what is no run folder is told later."""
+    if run.is_dir():
+        check_place(run, "RUN")
 
 
 def _check_animation(animation: Path | None) -> None:
@@ -391,6 +405,8 @@ def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
         name, mark, value = item.rpartition("=")
         if not mark or not name:
             raise bad_input("lunar-mjx", option, item, "is not NAME=VALUE", "give both")
+        if name in out:
+            raise bad_input("lunar-mjx", option, item, f"gives {name} twice", "give it once")
         out[name] = value
     # Checked here, where the option can be named; a run folder would only say that it holds an unknown split.
     for value in out.values() if option == "--split" else ():
@@ -532,10 +548,12 @@ def print_probabilities(diagnosis: Diagnosis, console: Any) -> None:
     )
     console.print(f"What remains, by port: {remains}", highlight=False)
     held = diagnosis.details.get("held_out", {})
-    if held.get("manoeuvres"):
+    if count := held.get("manoeuvres"):
+        # one group alone has no spread
+        spread = f" +- {held['se']:.1f}" if count > 1 else ""
         console.print(
-            f"Held out: log predictive density {held['gain']:+.1f} +- {held['se']:.1f} over the model as it is "
-            f"({held['manoeuvres']} groups that chose nothing)",
+            f"Held out: log predictive density {held['gain']:+.1f}{spread} over the model as it is "
+            f"({count} group{'s' if count > 1 else ''} that chose nothing)",
             highlight=False,
         )
 

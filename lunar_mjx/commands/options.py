@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -50,19 +51,43 @@ def select_device(device: str) -> None:
         )
 
 
-def check_folder(out: Path) -> None:
-    """Refuses, before any work is done, an output folder that is a file or lies in one."""
+HOLDS = {"log.toml": "a log", "run.json": "a run of compare"}
+"""What a folder keeps, by the file that tells; nothing else is written among it, or one would spoil the other."""
+
+
+def check_folder(out: Path, own: str = "", option: str = "--out") -> None:
+    """Refuses, before any work is done, an output folder that holds something else, or that `check_place` refuses.
+
+    Args:
+      out: the folder. own: file of `HOLDS` that the command itself writes there. option: which names the folder.
+    """
+    for name, what in HOLDS.items():
+        if name != own and (out / name).exists():
+            raise bad_input("lunar-mjx", option, str(out), f"holds {what} ({name})", "name another folder")
+    check_place(out, option)
+
+
+def check_place(out: Path, option: str = "--out") -> None:
+    """Refuses, before any work is done, an output folder that is a file, lies in one, or cannot be written to."""
     # The nearest part that exists decides; what lies below it can be made.
     for path in (out, *out.parents):
+        if path.is_symlink() and not path.exists():
+            raise bad_input("lunar-mjx", option, str(out), f"cannot be made: {path} leads nowhere", "mend that link")
         if path.exists():
             if not path.is_dir():
-                raise bad_input("lunar-mjx", "--out", str(out), f"is not a folder: {path} is a file", "name a folder")
-            return
+                raise bad_input("lunar-mjx", option, str(out), f"is not a folder: {path} is a file", "name a folder")
+            try:
+                # Tried, and not asked: permissions say nothing of disks that can only be read.
+                with tempfile.TemporaryFile(dir=path):
+                    return
+            except OSError as error:
+                problem = f"cannot be written: {path} takes no file ({error.strerror or error})"
+                raise bad_input("lunar-mjx", option, str(out), problem, "name another folder") from None
 
 
-def make_folder(out: Path) -> Path:
-    """Makes the output folder."""
-    check_folder(out)
+def make_folder(out: Path, own: str = "") -> Path:
+    """Makes the output folder; see `check_folder`."""
+    check_folder(out, own)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

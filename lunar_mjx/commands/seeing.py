@@ -30,6 +30,7 @@ def plot(
     """Plot a drive: path on shaded relief, slope, slip, sinkage, temperature and power over time."""
     path = out or run / "summary.png"
     # Before the imports, which take seconds.
+    _require_drive(run)
     _check_file(path, (".png", ".svg", ".pdf"))
     from lunar_mjx.visual.plots import drive_summary, save
     from lunar_mjx.visual.recorded import read_drive
@@ -73,6 +74,7 @@ def render(
 
     path = out or run / "drive.mp4"
     # Before the drive is read and its pictures drawn.
+    _require_drive(run)
     _check_file(path, (".mp4", ".webp", ".gif"))
     check_finite(speed=speed)
     if speed < 0:
@@ -217,13 +219,19 @@ def _refuse(option: str, text: str, between: str) -> list:
     )
 
 
+def _require_drive(run: Path) -> None:
+    """Refuses what is no folder before its default output, which lies in it, is looked at."""
+    if not run.is_dir():
+        raise bad_input("drive", "RUN", str(run), "is not a folder", "give the folder that lunar-mjx simulate wrote")
+
+
 def _check_file(path: Path, endings: tuple[str, ...]) -> None:
     """Refuses, before any work is done, a file of another kind or one that cannot be made."""
-    from lunar_mjx.commands.options import check_folder
+    from lunar_mjx.commands.options import check_place
 
     if path.suffix.lower() not in endings:
         raise bad_input("lunar-mjx", "--out", str(path), "is of no known kind", f"end it in {', '.join(endings)}")
-    check_folder(path.parent)
+    check_place(path.parent)
 
 
 def register(app: typer.Typer, terrain_app: typer.Typer) -> None:

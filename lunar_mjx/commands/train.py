@@ -79,8 +79,8 @@ def train(
     coordinator: Annotated[
         str | None, typer.Option(help="HOST:PORT of the first process, where several hosts train together.")
     ] = None,
-    processes: Annotated[int, typer.Option(help="How many processes train together.")] = 1,
-    process: Annotated[int, typer.Option(help="Which of them this is, from 0; the first writes the files.")] = 0,
+    processes: Annotated[int, typer.Option(min=1, help="How many processes train together.")] = 1,
+    process: Annotated[int, typer.Option(min=0, help="Which of them this is, from 0; the first writes the files.")] = 0,
 ) -> None:
     """Train a policy; resumes from the folder's newest checkpoint."""
     from lunar_mjx.commands.options import check_folder, make_folder, select_device

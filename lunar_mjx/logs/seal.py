@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError, bad_input, one_line, require_file
-from lunar_mjx.files import write_text
+from lunar_mjx.files import no_key_twice, write_text
 from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.readers.folder import ANSWER, LOG_FILE, read_log
 from lunar_mjx.toml_fields import Fields
@@ -167,25 +167,42 @@ def unseal(answer: str | Path, log: str | Path, verdict: str | Path | None = Non
     return result
 
 
+LABELS = {
+    "NOISE_ONLY": False,
+    "BAD_DATA": False,
+    "BAD_FIT": False,
+    "KNOWN": True,
+    "KNOWN_CLASS": True,
+    "MULTIPLE": True,
+    "UNKNOWN": False,
+    "UNDECIDABLE": False,
+}
+"""Labels of verdicts, and whether they name effects."""
+
+
 def read_verdict(path: str | Path) -> tuple[str, list[str]]:
     """Label and effects of a `verdict.json`.
 
     Raises:
-      UserError: the file is missing or holds no verdict.
+      UserError: the file is missing, holds no verdict, or one of an unknown label or of a name without an effect.
     """
     path = Path(path) / "verdict.json" if Path(path).is_dir() else Path(path)
     require_file(path, "the verdict")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=no_key_twice)
         label, effects = data["verdict"], data.get("effects", [])
         # A text would be taken for its letters, and score as a wrong answer.
         if not isinstance(label, str) or not isinstance(effects, list) or not all(isinstance(e, str) for e in effects):
-            raise TypeError
-        return label, effects
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise bad_input(
-            path, "verdict", None, "is not there", 'give a JSON file with "verdict" and "effects"'
+            raise TypeError("verdict and effects are a text and a list of texts")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(
+            f'{path}: is no verdict ({one_line(error)[:150]}); give a JSON file with "verdict" and "effects".'
         ) from None
+    if label not in LABELS:
+        raise bad_input(path, "verdict", label, "is no verdict", f"give one of {', '.join(LABELS)}")
+    if LABELS[label] and not effects:
+        raise bad_input(path, "effects", effects, f"are none, and {label} names some", "give the verdict as it was")
+    return label, effects
 
 
 def score(answer: Answer, label: str, effects: Sequence[str]) -> str:

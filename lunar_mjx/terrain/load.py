@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import UserError, bad_input, require_file
 from lunar_mjx.resources import find
 from lunar_mjx.terrain.config import ClassesTable, GridsTable, SoilTable, TerrainConfig, parse_config, read_config
 from lunar_mjx.terrain.dem import Dem
@@ -211,10 +211,7 @@ def _dem_file(config: TerrainConfig, name: str, folder: Path, dem: str | Path | 
     # The nearer wins: a call's argument, then the shell's, then the file's.
     for source, given in (("dem", dem), (_variable(name), os.environ.get(_variable(name)))):
         if given:
-            path = Path(given)
-            if not path.is_file():
-                raise UserError(f"{path}: the DEM given by {source} is not there; check the path or its spelling.")
-            return path
+            return require_file(given, f"the DEM given by {source}")
     if config.dem is not None and config.dem.file is not None:
         return folder / config.dem.file
     return None

@@ -99,7 +99,11 @@ class RecordedDrive:
                     f"lack {name}",
                     "write the drive anew with lunar-mjx simulate",
                 )
-        return self.table[names].to_numpy(float)
+        try:
+            return self.table[names].to_numpy(float)
+        except ValueError as error:
+            problem = f"{self.folder / TABLE}: holds what is no number ({one_line(error)})"
+            raise UserError(f"{problem}; write it anew with lunar-mjx simulate.") from None
 
     @functools.cached_property
     def qpos(self) -> np.ndarray:

@@ -24,6 +24,8 @@ _BEHIND = 1.2
 until the Sun is within about 45 degrees of the heading."""
 LONGEST = 20.0
 """Length of a video whose speed is chosen, s."""
+MOST_PICTURES = 200_000
+"""Pictures of a video: almost an hour of the most that a second takes, days of drawing."""
 
 
 def frame_rows(drive: RecordedDrive, fps: int, speed: float) -> tuple[np.ndarray, float]:
@@ -31,6 +33,9 @@ def frame_rows(drive: RecordedDrive, fps: int, speed: float) -> tuple[np.ndarray
     length = drive.time[-1] - drive.time[0]
     if speed == 0.0:
         speed = max(1.0, math.ceil(length / LONGEST))
+    if (pictures := length * fps / speed) > MOST_PICTURES:
+        problem = f"makes {pictures:.3g} pictures, above {MOST_PICTURES}"
+        raise bad_input("render", "speed", speed, problem, "give a higher speed")
     at = drive.time[0] + np.arange(0.0, length + 1e-9, speed / fps)
     # A picture at a row's very time shows that row, whatever the last digits are.
     return np.clip(np.searchsorted(drive.time, at + 1e-9) - 1, 0, len(drive.time) - 1), speed

@@ -39,7 +39,7 @@ def test_mistakes(run, tmp_path, options, words):
 
 @pytest.mark.skipif(HERE, reason="the extra `particles` is installed")
 def test_without_the_extra(run, tmp_path):
-    result = run("bed", "simulate", tmp_path / "out", *WHEEL, "--slips", 0.1, "--loads", 10, "--controls", 0)
+    result = run("bed", "simulate", tmp_path / "out", *WHEEL, "--slips", 0.1, "--loads", 10)
     assert result.status == 2 and "pip install 'lunar-mjx[particles]'" in result.err
     assert result.err.count("\n") == 1 and not (tmp_path / "out").exists()
 

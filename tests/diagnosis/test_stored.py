@@ -59,6 +59,9 @@ def test_a_torn_archive_is_refused(tmp_path):
         path.write_bytes(whole[:cut])
         with pytest.raises(UserError, match=r"series\.npz: is damaged"):
             _traces(path)
+    path.write_text("text")
+    with pytest.raises(UserError, match=r"damaged \(it is no archive of arrays\)"):  # and no advice to run a pickle
+        _traces(path)
     path.write_bytes(whole.replace(b"measured", b"mxasured"))
     with pytest.raises(UserError, match=r"lacks 'measured'|is damaged"):
         _traces(path)
@@ -119,4 +122,12 @@ def test_results_of_another_shape_are_refused_before_a_page_is_made_of_them(name
     assert read_stored(path) == GOOD_RESULTS[name]
     path.write_text(json.dumps({**GOOD_RESULTS[name], **change}))
     with pytest.raises(UserError, match=rf"{name}: is damaged \({next(iter(change))}.*\); make it anew"):
+        read_stored(path)
+
+
+def test_a_key_that_stands_twice_is_damage(tmp_path):
+    """Else the last one would win without a word."""
+    path = tmp_path / "verdict.json"
+    path.write_text('{"verdict": "KNOWN", "verdict": "NOISE_ONLY", "sentence": "x", "effects": []}')
+    with pytest.raises(UserError, match="the key 'verdict' stands there twice"):
         read_stored(path)

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.errors import UserError
 from lunar_mjx.logs import Log, Recording, check, commands, log_model, read_log, simulate_log, unseal
 from lunar_mjx.logs.recorder import simulate as module
 from lunar_mjx.logs.recorder.instruments import RATES, parse_noise, record
-from lunar_mjx.logs.seal import Answer, answer_path, read_answer, read_verdict, score, write_answer
+from lunar_mjx.logs.seal import LABELS, Answer, answer_path, read_answer, read_verdict, score, write_answer
 from lunar_mjx.manoeuvres import commands as manoeuvre_commands
 from lunar_mjx.manoeuvres import load_manoeuvre
 from lunar_mjx.model import make_model
@@ -205,8 +206,34 @@ def test_a_verdict_is_compared(fast: None, tmp_path: Path) -> None:
 )
 def test_a_verdict_of_another_kind_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "verdict.json").write_text(text)
-    with pytest.raises(UserError, match=r'verdict\.json: verdict = None is not there; give a JSON file with "verdict"'):
+    with pytest.raises(UserError, match=r'verdict\.json: is no verdict \(.+\); give a JSON file with "verdict"'):
         read_verdict(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"verdict": "BANANA", "effects": []}', "verdict = 'BANANA' is no verdict; give one of NOISE_ONLY"),
+        ('{"verdict": "", "effects": []}', "verdict = '' is no verdict"),
+        ('{"verdict": "KNOWN", "effects": []}', "KNOWN names some"),
+        ('{"verdict": "KNOWN", "verdict": "NOISE_ONLY", "effects": []}', "the key 'verdict' stands there twice"),
+        ("", "Expecting value"),
+    ],
+)
+def test_a_verdict_that_says_nothing_is_not_scored(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "verdict.json").write_text(text)
+    with pytest.raises(UserError, match=said):
+        read_verdict(tmp_path)
+
+
+def test_a_verdict_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "verdict.json").write_text('{"verdict": "NOISE_ONLY"}', encoding="utf-8-sig")
+    assert read_verdict(tmp_path) == ("NOISE_ONLY", [])
+
+
+def test_every_verdict_can_be_scored() -> None:
+    naming = {Verdict.KNOWN, Verdict.KNOWN_CLASS, Verdict.MULTIPLE}
+    assert {v.label: v in naming for v in Verdict} == LABELS
 
 
 ANSWER = Answer("a", "0" * 64, 3, "consistent", "slope", 1.0, [], {"dropouts": 0.0}, "0" * 64)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
 
 from lunar_mjx.errors import UserError
 from lunar_mjx.visual.recorded import read_drive
+from lunar_mjx.visual.video import frame_rows
 
 
 @pytest.mark.parametrize("name", ["viper", "luvmi"])
@@ -60,3 +62,20 @@ def test_mistakes_are_one_sentence(luvmi, tmp_path):
     (tmp_path / "drive.csv").write_text("\n".join([header, *rows[1:]]))
     with pytest.raises(UserError, match="lack wheel_lf_slip_ratio; write the drive anew"):
         read_drive(tmp_path).per_wheel("wheel_{}_slip_ratio")
+
+
+def test_a_table_of_text_is_one_sentence(luvmi, tmp_path):
+    drive = tmp_path / "drive"
+    shutil.copytree(luvmi[0], drive)
+    lines = (drive / "drive.csv").read_text().splitlines()
+    lines[2] = lines[2].replace("0.", "x.", 3)
+    (drive / "drive.csv").write_text("\n".join(lines))
+    with pytest.raises(UserError, match=r"drive\.csv: holds what is no number \(.*x\..*\); write it anew"):
+        read_drive(drive).tracks()
+
+
+def test_a_video_of_endless_pictures_is_refused(luvmi):
+    drive = read_drive(luvmi[0])
+    with pytest.raises(UserError, match=r"speed = 1e-09 makes .* pictures"):
+        frame_rows(drive, 20, 1e-9)
+    assert len(frame_rows(drive, 20, 0.5)[0]) > 10

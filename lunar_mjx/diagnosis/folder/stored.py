@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from lunar_mjx.errors import UserError
+from lunar_mjx.errors import UserError, no_archive
+from lunar_mjx.files import no_key_twice
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Split = Literal["fit", "select", "test", "apart"]
@@ -125,7 +126,7 @@ def read_stored(path: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=no_key_twice)
         _SCHEMAS.get(path.name, _ANY).validate_python(content)
     except (ValueError, RecursionError) as error:  # ValidationError, JSONDecodeError and UnicodeDecodeError are such
         raise UserError(
@@ -159,4 +160,6 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # zip archives, their compression and NumPy's headers raise a dozen kinds
-        raise UserError(f"{path}: is damaged ({_told(error)}); make it anew with lunar-mjx compare or why.") from None
+        raise UserError(
+            f"{path}: is damaged ({no_archive(error)[:150]}); make it anew with lunar-mjx compare or why."
+        ) from None

@@ -22,6 +22,8 @@ from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, UNLISTED_SHARE, Hy
 
 SettingsKind = TypeVar("SettingsKind", bound="SearchSettings")
 """The class itself or one that adds to it: annotations are checked method by method, where `Self` has no meaning."""
+LARGEST_SETTING = 1e6
+"""Of any size, odds or count: beyond it a prior is none, and its matrices cannot be solved in double precision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,11 +80,16 @@ class SearchSettings:
                 values[name] = _like(usual[name], value)
             except (TypeError, ValueError):
                 raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
-            # Sizes, shares, probabilities, odds (of which the logarithm is taken) and counts: none is below zero.
-            most = 1.0 if name.endswith(("sure", "_share")) else math.inf
+            shares = isinstance(usual[name], tuple) and usual[name] and not isinstance(usual[name][0], str)
+            if shares and len(values[name]) != len(usual[name]):
+                raise bad_input("settings", name, value, "has another length", f"give it like {usual[name]}")
+            # Sizes, shares, probabilities, odds and counts: none is below zero. Of odds and of a discrepancy's size the
+            # logarithm is taken, and a length is divided by.
+            most = 1.0 if name.endswith(("sure", "_share")) else LARGEST_SETTING
             for number in values[name] if isinstance(values[name], tuple) else (values[name],):
                 if not isinstance(number, str):
-                    require_within("settings", name, number, 0.0, most, above=name.endswith("_odds"))
+                    above = name.endswith(("_odds", "_length", "_discrepancy"))
+                    require_within("settings", name, number, 0.0, most, above=above)
         return cls(**values)
 
     @property

@@ -950,7 +950,7 @@ def make_navigation(
 
         model = load_model(model)
     if model is None:
-        model = make_model(rover, terrain or "lunar_plain", preset or default_preset(task))
+        model = make_model(rover, "lunar_plain" if terrain is None else terrain, preset or default_preset(task))
     elif terrain is not None:
         model = model.replace(terrain=terrain)
     if config.rung and get_rung(config.rung).battery and "battery" not in model.effect_names:
