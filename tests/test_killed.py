@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def _command(folder: Path, at: int, *arguments: object) -> subprocess.CompletedProcess[str]:
+def _command(folder: Path, at: int | str, *arguments: object) -> subprocess.CompletedProcess[str]:
     line = [sys.executable, "-m", "tests.killed_run", str(folder), str(at), *map(str, arguments)]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     return subprocess.run(line, cwd=folder, env=env, capture_output=True, text=True, check=False)
@@ -34,6 +34,11 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 def _touches(done: subprocess.CompletedProcess[str]) -> int:
     return int(done.stdout.splitlines()[-1])
+
+
+def _sizes(files: dict[str, bytes]) -> list[str]:
+    """Sizes at which a kill tears a file, for `killed_run`: its first byte, its middle and its last byte."""
+    return [f"{size}b" for size in sorted({s for data in files.values() for s in (0, len(data) // 2, len(data) - 1)})]
 
 
 def _places(count: int, kills: int) -> list[int]:
@@ -65,16 +70,28 @@ def test_a_killed_command_leaves_every_file_old_or_new(name, tmp_path):
     assert before.keys() == after.keys() and any(before[k] != after[k] for k in before)
     places = _places(_touches(done), 5)
     assert len(places) == min(5, _touches(done)) >= 3, "a mesh alone is opened, renamed and looked for"
-    for at in places:
+    # Between two touches a file is written: a kill there tears what is written in place.
+    largest = max(after.values(), key=len)
+    for at in (*places, *_sizes({"largest": largest})):
         folder = tmp_path / f"killed{at}"
         shutil.copytree(old, folder)
-        assert _command(folder, at, *second).returncode == -signal.SIGKILL
+        assert _command(folder, at, *second).returncode in (-signal.SIGKILL, -signal.SIGXFSZ)
         left = _contents(folder)
         assert left.keys() == before.keys()
         torn = [k for k in left if left[k] not in (before[k], after[k])]
         assert not torn, (at, torn)
         assert _command(folder, 0, *second).returncode == 0
         assert _contents(folder) == after
+
+
+def _require_whole(folder: Path) -> None:
+    """Every JSON file and archive is read as a whole."""
+    for path in (p for p in folder.rglob("*") if not p.name.startswith(".")):
+        if path.suffix == ".json":
+            json.loads(path.read_bytes())
+        elif path.suffix == ".npz":
+            with np.load(path) as archive:
+                assert all(archive[name] is not None for name in archive.files)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +121,12 @@ def test_why_that_is_killed_ten_times_ends_alike(compared, tmp_path):
             shutil.copytree(compared, broken)
             killed = _command(broken, at, *ask)
         assert killed.returncode == -signal.SIGKILL, killed.stderr[-2000:]
-        for name, data in _contents(broken).items():
-            if name.endswith(".json"):
-                json.loads(data)
+        _require_whole(broken)
+    # In the midst of files, too, of which the verdict is written last.
+    for at in _sizes({n: wanted[n] for n in ("run/verdict.json", "run/signatures.npz")}):
+        shutil.rmtree(broken)
+        shutil.copytree(compared, broken)
+        assert _command(broken, at, *ask).returncode == -signal.SIGXFSZ, at
+        _require_whole(broken)
     assert _command(broken, 0, *ask).returncode == verdict["exit_status"]
     assert json.loads(_contents(broken)["run/verdict.json"]) == verdict
