@@ -26,9 +26,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     if not path.name:
         raise UserError(f"{path}: is a folder and no file; name a file in it, as in {path / 'out'}.")
-    path = _place(path)
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
+        path = _place(path)
+        part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
         try:
             yield part
             with part.open("rb+") as file:
@@ -44,10 +44,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
 def _place(path: Path) -> Path:
     """Where a file lies that `path` names; links are followed."""
     if path.is_symlink():
-        try:
+        with suppress(RuntimeError):  # of links in a circle, before Python 3.13
             path = path.resolve()
-        except (OSError, RuntimeError):  # of Python 3.13, and before
-            raise UserError(f"{path}: is a link that leads to itself; name a file.") from None
+        if path.is_symlink():
+            raise UserError(f"{path}: is a link that leads to itself; name a file.")
     try:
         kind = path.stat().st_mode
     except OSError:  # nothing is there, or it is told when it is written

@@ -311,6 +311,8 @@ def test_a_link_stays_one_and_its_file_is_replaced(tmp_path):
     loop.symlink_to(loop)
     with pytest.raises(UserError, match="leads to itself"):
         write_text(loop, "new")
+    with pytest.raises(UserError, match=r"cannot be written \(File name too long\)"):
+        write_text(tmp_path / ("x" * 300), "new")
 
 
 def test_a_pipe_or_a_device_is_never_renamed_over(tmp_path, run):
