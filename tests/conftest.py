@@ -31,16 +31,18 @@ settings.load_profile("any machine")
 
 
 LONGEST = (
-    "test_effect_contract.py",
+    "test_drive_form.py",
     "test_hidden_subset.py",
+    "test_effect_contract.py",
     "test_windows.py",
     "test_verbs_table.py",
-    "test_camera_blocks.py",
-    "test_escape.py",
-    "test_distill.py",
+    "test_dust_in_jax.py",
     "test_drive.py",
+    "test_bus_current.py",
+    "test_pybullet.py",
 )
-"""Files of half a minute or more. They go first, or one of two processes would wait for the other at the end."""
+"""Files of twenty seconds of the processor or more. They go first, or one of two processes would wait for the other at
+the end."""
 
 
 @pytest.hookimpl(trylast=True)
