@@ -266,6 +266,16 @@ def test_a_search_ends_where_the_time_is_up_before_gains_were_seen():
     form.late_race = True
     found = search([form], most_refits=12, most_terms=4, window=4.0)
     assert form.made == [frozenset()] and not found.complete
+    assert found.unseen and not found.waiting
+
+
+def test_what_was_seen_to_gain_waits_for_its_refit():
+    form = Seen(measured(0, wave=0.8))
+    form.gains = {"twin": 30.0, "square": 20.0, "wave": 1.0}
+    found = search([form], most_refits=2, most_terms=4, window=4.0)
+    assert form.made == [frozenset(), frozenset({"twin"})] and not found.complete
+    # one nat is less than its odds
+    assert found.waiting == {"square"}
 
 
 def test_a_refit_that_fails_is_no_hypothesis_and_is_told():

@@ -103,6 +103,8 @@ class ModelSearch:
       refits: made. failed: "form with effects: reason" of each refit whose solver failed.
       complete: whether no hypothesis near the best was left without a refit.
       unchallenged: effects of the best refit without which none was made from where that had ended.
+      waiting: effects that were seen to gain beside some refit, and that none has tried there.
+      unseen: whether it was not looked at what effects gain beside the best refit.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -111,6 +113,8 @@ class ModelSearch:
     failed: tuple[str, ...]
     complete: bool
     unchallenged: frozenset[str] = frozenset()
+    waiting: frozenset[str] = frozenset()
+    unseen: bool = False
 
     @property
     def best(self) -> Hypothesis:
@@ -407,9 +411,17 @@ class _Search:
         # relative to the best, for evidences differ by thousands
         weight = np.exp([h.log_posterior - order[0].log_posterior for h in order])
         leads = next((h for h in order if h.refitted), None)
-        unchallenged = leads.effects - self.challenged(leads.form) if leads else frozenset[str]()
+        by_name = {form.name: form for form in self.forms}
+        waiting = [self.gaining(by_name[name], beside, gains) for (name, beside), gains in self.seen.items()]
         return ModelSearch(
-            tuple(order), weight / weight.sum(), self.refits, tuple(self.reasons), complete, unchallenged
+            tuple(order),
+            weight / weight.sum(),
+            self.refits,
+            tuple(self.reasons),
+            complete,
+            unchallenged=leads.effects - self.challenged(leads.form) if leads else frozenset(),
+            waiting=frozenset().union(*waiting),
+            unseen=leads is not None and (leads.form, leads.effects) not in self.seen,
         )
 
     def untried(self, best: Hypothesis) -> list[str]:

@@ -30,7 +30,7 @@ from lunar_mjx.diagnosis.unknown_inputs.inputs import FOLLOWS
 from lunar_mjx.diagnosis.unknown_inputs.port_fields import DRIVEN, Usual, rotation
 from lunar_mjx.diagnosis.verbs import explain
 from lunar_mjx.diagnosis.verdict import Verdict
-from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unrefitted, _without
+from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unlooked, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, helps
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
 from lunar_mjx.diagnosis.weighed.held_to_account import account
@@ -642,6 +642,24 @@ def test_a_refit_without_time_leaves_the_linear_estimate():
     # what a refit has held is still said to help
     assert sentence.startswith("It acts at soil. Beside it lag helps. A first-order estimate points to drag beside it,")
     assert sentence.endswith(" More.")
+
+
+@pytest.mark.parametrize(
+    ("waiting", "unseen", "why"),
+    [
+        (frozenset({"lag", "drag"}), False, "drag, lag gained beside the model within a few steps, and had no refit"),
+        (frozenset(), True, "What effects gain beside the best refit was not looked at"),
+    ],
+)
+def test_nothing_unlisted_is_believed_before_what_was_seen_to_gain_had_its_refit(waiting, unseen, why):
+    said = Conclusion(Verdict.UNKNOWN, ("a",), True, "soil", 0.99, "It acts at soil." + helps(("a",)), helping=("a",))
+    found = SimpleNamespace(waiting=waiting, unseen=unseen)
+    told, sentence = _unlooked(said, said.sentence, found)  # type: ignore[arg-type]
+    assert (told.verdict, told.effects, told.unlisted, told.probability) == (Verdict.UNDECIDABLE, (), False, 0.0)
+    assert sentence.startswith("By what was refitted: It acts at soil.") and why in sentence
+    assert _unlooked(said, said.sentence, SimpleNamespace(waiting=frozenset(), unseen=False)) == (said, said.sentence)
+    quiet = Conclusion(Verdict.NOISE_ONLY, (), False, None, 0.99, "Nothing is missing.")
+    assert _unlooked(quiet, quiet.sentence, found) == (quiet, quiet.sentence)  # type: ignore[arg-type]
 
 
 class Stopped(Toy):
