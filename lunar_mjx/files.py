@@ -7,7 +7,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from lunar_mjx.errors import UserError
 
@@ -75,6 +75,35 @@ def appending(path: str | Path) -> Iterator[Path]:
             raise
     except OSError as error:
         raise _refused(path, error) from error
+
+
+def only_writer(folder: Path, name: str, what: str) -> IO[str]:
+    """An open file that keeps others out of a folder until it is closed or its process ends.
+
+    Args:
+      folder: which is made. name: of the file, which stays. what: writes there, for the sentence that refuses a second.
+
+    Raises:
+      UserError: another one writes there, or the operating system refuses.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / name).open("a+", encoding="utf-8")
+    except OSError as error:
+        raise _refused(folder / name, error) from error
+    try:
+        import fcntl
+
+        # A lock of the open file: it falls with the process, where a file that is merely there would stay.
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # Windows refuses to rename over open files instead
+        pass
+    except OSError:
+        file.close()
+        raise UserError(
+            f"{folder}: another {what} writes there; wait for it, end it, or name another folder."
+        ) from None
+    return file
 
 
 def _refused(path: Path, error: OSError) -> UserError:

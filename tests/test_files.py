@@ -367,7 +367,7 @@ WHOLE = re.compile(r"\b\w*_?part\b|to_csv\(index=False\)|export\(file_type")
 """A call that names a part of `replacing`, or gives back what it would write."""
 OPENED = (
     "open(os.devnull, 'w')",
-    "(folder / LOCK).open('a+'",  # holds nothing
+    "(folder / name).open('a+'",  # holds nothing
     "path.open('a', encoding='utf-8')",  # the path of `appending`
     "av.open(str(path), 'w')",  # the part that `encode.writer` gives
 )

@@ -18,7 +18,8 @@ from lunar_mjx.agents.learner import EPISODE, Learner, TrainState
 from lunar_mjx.agents.policy import Policy, policy_of, save_policy
 from lunar_mjx.agents.record import Progress, Record
 from lunar_mjx.envs.navigation.env import NavigationEnv
-from lunar_mjx.errors import UserError, bad_input
+from lunar_mjx.errors import bad_input
+from lunar_mjx.files import only_writer
 from lunar_mjx.together import agreed, everywhere, leads, of_the_first
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ class _Loop:
     def _begin(self) -> None:
         learner, run, folder = self.learner, self.config, self.folder
         with agreed("opening its folder"):
-            self.lock = only_writer(folder) if folder and self.lead else None
+            self.lock = only_writer(folder, LOCK, "training") if folder and self.lead else None
         made = {"train": dataclasses.asdict(learner.config), "seed": run.seed, "environment": self.environment}
         settings = plain(made | ({"begin_with": run.begin_with} if run.begin_with else {}))
         self.checkpoints = _checkpoints(folder / "checkpoints", settings) if folder else None
@@ -286,29 +287,6 @@ class _Loop:
             self.checkpoints.close()
         if self.lock:
             self.lock.close()
-
-
-def only_writer(folder: Path) -> IO[str]:
-    """An open file that keeps other trainings out of a folder until it is closed or its process ends.
-
-    Raises:
-      UserError: another training writes there.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    file = (folder / LOCK).open("a+", encoding="utf-8")
-    try:
-        import fcntl
-
-        # A lock of the open file: it falls with the process, where a file that is merely there would stay.
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # Windows refuses to rename over open files instead
-        pass
-    except OSError:
-        file.close()
-        raise UserError(
-            f"{folder}: another training writes there; wait for it, end it, or train into another folder."
-        ) from None
-    return file
 
 
 def _checkpoints(folder: Path, settings: dict[str, Any]) -> Checkpoints:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -13,6 +14,7 @@ import typer
 from lunar_mjx.commands.compiled import keep_compiled
 from lunar_mjx.commands.options import MOST_SEED, check_folder, check_place
 from lunar_mjx.errors import UserError, bad_input, plain_digits
+from lunar_mjx.files import only_writer
 
 if TYPE_CHECKING:
     from lunar_mjx.diagnosis.runs import Run
@@ -103,7 +105,7 @@ def compare(
     _require_imposed("--fix", fix, logs)
     keep_compiled()
     try:
-        with console_progress() as progress:
+        with _alone(out), console_progress() as progress:
             run = verbs.compare(
                 logs,
                 _with_priors(_model(model, preset, logs), prior, fix),
@@ -140,7 +142,7 @@ def why(
 
     _require_room(run)
     keep_compiled()
-    with console_progress() as progress:
+    with _alone(run), console_progress() as progress:
         diagnosis = verbs.why(run, only, progress=progress, seconds=seconds, about=explain)
         # The verdict is written by now: an audit that is broken off loses nothing of it.
         if audit > 0:
@@ -167,7 +169,7 @@ def next_(
 
     _require_room(run)
     keep_compiled()
-    with console_progress() as progress:
+    with _alone(run), console_progress() as progress:
         found = next_experiment(run, between or (), seconds, progress)
     print(json.dumps(found.to_dict(), indent=2) if as_json else found.sentence)
 
@@ -184,7 +186,7 @@ def add(
     check_folder(out, "run.json")
     keep_compiled()
     try:
-        with console_progress() as progress:
+        with _alone(out), console_progress() as progress:
             grown = verbs.add(run, effect, out, progress)
     except verbs.BadData as bad:
         _finish(bad.diagnosis, False)
@@ -206,7 +208,7 @@ def unknown(
 
     _require_room(run)
     keep_compiled()
-    with console_progress() as progress:
+    with _alone(run), console_progress() as progress:
         found = discover(run, port, out, progress=progress)
     print(json.dumps(plain(found.to_dict()), indent=2) if as_json else found.text())
 
@@ -269,7 +271,7 @@ def improve(
 
     check_folder(out, "run.json")
     keep_compiled()
-    with console_progress() as progress:
+    with _alone(out), console_progress() as progress:
         diagnosis, runs = verbs.improve(
             logs,
             _model(model, preset, logs),
@@ -321,6 +323,16 @@ def watch(
         print("No alarm: nothing began that is larger than what these drives do anyway.")
     # Of the last alarm, as the verdict of `why` is one: scripts branch on it.
     raise typer.Exit(status)
+
+
+@contextmanager
+def _alone(run: Path) -> Iterator[None]:
+    """Keeps other commands out of a run folder that is there: of two at once, files would be of one or the other."""
+    if not (run / "run.json").is_file():
+        yield
+        return
+    with only_writer(run, ".writing", "command of lunar-mjx"):
+        yield
 
 
 def _require_room(run: Path) -> None:

@@ -15,9 +15,10 @@ from lunar_mjx.agents import train as training
 from lunar_mjx.agents.checkpoint import Checkpoints
 from lunar_mjx.agents.configs import get_training, override
 from lunar_mjx.agents.learner import Learner
-from lunar_mjx.agents.train import RunConfig, only_writer, train
+from lunar_mjx.agents.train import LOCK, RunConfig, train
 from lunar_mjx.envs import PointEnv
 from lunar_mjx.errors import UserError
+from lunar_mjx.files import only_writer
 
 
 def test_empty_arrays_come_back_on_the_devices_that_the_step_expects(tmp_path):
@@ -99,12 +100,12 @@ def test_a_checkpoint_of_other_settings_is_refused_by_name(tmp_path):
 
 
 def test_a_second_training_in_one_folder_is_refused_at_once(tmp_path):
-    first = only_writer(tmp_path)
+    first = only_writer(tmp_path, LOCK, "training")
     with pytest.raises(UserError, match="another training writes there"):
         train(_learner(), RunConfig(160, quiet=True), tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [training.LOCK]
     first.close()
-    only_writer(tmp_path).close()
+    only_writer(tmp_path, LOCK, "training").close()
 
 
 def _learner() -> Learner:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lunar_mjx.agents.train import only_writer
+from lunar_mjx.agents.train import LOCK
+from lunar_mjx.files import only_writer
 from tests.agents.point_process import command, free_port, results_of_two, run, run_both, run_two
 from tests.cli_harness import MAIN
 
@@ -87,7 +88,7 @@ def test_an_error_in_one_process_ends_the_other_with_a_sentence(tmp_path):
 
 
 def test_a_folder_that_is_taken_ends_both(tmp_path):
-    with only_writer(tmp_path):
+    with only_writer(tmp_path, LOCK, "training"):
         first, second = run_two(tmp_path)
     assert first.returncode == second.returncode == 1
     assert "another training writes there" in first.stderr

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lunar_mjx.commands import options
+from lunar_mjx.files import only_writer
 from tests.cli_harness import Run
 from tests.commands.test_cli_mistakes import STEADY, assert_one_sentence
 
@@ -82,6 +83,20 @@ def test_a_run_folder_that_takes_no_file_is_refused(verb, line, run: Run, tmp_pa
 
     monkeypatch.setattr(options.tempfile, "TemporaryFile", refuse)
     assert_one_sentence(run(verb, tmp_path), [f"RUN = '{tmp_path}' cannot be written", "Read-only file system"])
+
+
+@pytest.mark.parametrize("words", [("why",), ("next",), ("unknown",), ("compare", "FILES/bed", "--out")])
+def test_a_second_command_in_one_run_folder_is_refused(words, run: Run, tmp_path):
+    for name, text in STEADY.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(str(text))
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "run.json").write_text("mine")
+    with only_writer(folder, ".writing", "command of lunar-mjx"):
+        said = run(*(w.replace("FILES", str(tmp_path)) for w in words), folder)
+    assert_one_sentence(said, [f"{folder}: another command of lunar-mjx writes there; wait for it, end it, or name"])
+    assert (folder / "run.json").read_text() == "mine"
 
 
 def test_a_folder_that_can_be_made_is_taken_and_nothing_stays_in_it(tmp_path):
