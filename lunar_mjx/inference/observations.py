@@ -7,6 +7,7 @@ import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,34 +36,31 @@ class Chain:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class KalmanFilters:
-    """The filters of series of one length with a white noise and a slow one; they depend on their sizes alone, not on
-    what is read.
+class KalmanFilter:
+    """The filter of a series with a white noise and a slow one; it depends on their sizes alone, not on what is read.
 
     Attributes:
-      rows: (series, n) places of their readings among all observations.
-      variance: (series, n) of every innovation.
-      decay: (series, n) share of the slow noise's mean that is left from the time before. gain: (series, n).
+      variance: (n,) of every innovation.
+      decay: (n,) share of the slow noise's mean that is left from the time before. gain: (n,) of the filter.
     """
 
-    rows: np.ndarray
     variance: np.ndarray
     decay: np.ndarray
     gain: np.ndarray
 
     def innovations(self, columns: np.ndarray) -> np.ndarray:
-        """What each reading (series, n, k) adds to those before it, over its standard deviation."""
-        # One loop for all series and columns: LAPACK's solver of a system with two diagonals takes twice as long.
-        mean, out = np.zeros((columns.shape[0], columns.shape[2])), np.empty_like(columns)
-        share = (self.decay[:, 1:] * self.gain[:, :-1])[:, :, None]
-        left = self.decay[:, 1:, None] - share
-        out[:, 0] = columns[:, 0]
-        for i in range(1, columns.shape[1]):
-            mean *= left[:, i - 1]
-            mean += share[:, i - 1] * columns[:, i - 1]
-            np.subtract(columns[:, i], mean, out=out[:, i])
-        out /= np.sqrt(self.variance)[:, :, None]
-        return out
+        """What each reading (n, k) adds to those before it, over its standard deviation."""
+        if not columns.shape[1]:  # LAPACK's wrapper writes beyond an array without columns
+            return np.zeros(columns.shape)
+        # The slow noise's mean before a reading is a share of the one before and of that reading. All of them solve one
+        # system with two diagonals: a loop over time would go through all columns at every time.
+        bands = np.ones((2, len(columns)))
+        bands[1, :-1] = -self.decay[1:] * (1.0 - self.gain[:-1])
+        told = np.zeros(columns.shape, order="F")
+        told[1:] = (self.decay[1:] * self.gain[:-1])[:, None] * columns[:-1]
+        (solve,) = get_lapack_funcs(("tbtrs",), (bands, told))
+        mean, _ = solve(bands, told, uplo="L", diag="U", overwrite_b=True)
+        return np.asarray((columns - mean) / np.sqrt(self.variance)[:, None])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,33 +160,38 @@ class Observations:
         """
         flat = columns.reshape(len(self), -1)
         out = np.empty_like(flat, dtype=float)
-        white = np.ones(len(self), bool)
-        for filters in self._slow:
-            out[filters.rows] = filters.innovations(flat[filters.rows])
-            white[filters.rows] = False
-        out[white] = flat[white] / self.sigma()[white, None]
         for s in self.series:
-            if s.chain is not None and not _is_slow(s):
-                out[s.start : s.stop] = s.chain.whiten(out[s.start : s.stop])
+            part = slice(s.start, s.stop)
+            if not _is_slow(s):
+                out[part] = flat[part] / np.sqrt(np.square(s.white) + s.coloured**2).reshape(-1, 1)
+                if s.chain is not None:
+                    out[part] = s.chain.whiten(out[part])
+        for s, kalman in self._filters:
+            part = slice(s.start, s.stop)
+            out[part] = kalman.innovations(flat[part])
         return out.reshape(columns.shape)
 
     @functools.cached_property
-    def _slow(self) -> list[KalmanFilters]:
-        """Filters of the series with slow noise."""
-        lengths: dict[int, list[Series]] = {}
+    def _filters(self) -> list[tuple[Series, KalmanFilter]]:
+        """Series with slow noise, and the filters that whiten them."""
+        # series of one clock share the loop over its times, which is what costs
+        clocks: dict[tuple[int, bytes], list[Series]] = {}
         for s in self.series:
             if _is_slow(s):
-                lengths.setdefault(s.stop - s.start, []).append(s)
-        return [_kalman_filters(group) for group in lengths.values()]
+                clocks.setdefault((s.stop - s.start, np.asarray(s.time).tobytes()), []).append(s)
+        return [found for group in clocks.values() for found in zip(group, _kalman_filters(group), strict=True)]
 
     def log_widths(self) -> np.ndarray:
         """(n,) log of what `whiten` divides every innovation by, in the channels' units.
 
         Their sum is half the log determinant of the noise's covariance.
         """
-        out = np.log(self.sigma())
-        for filters in self._slow:
-            out[filters.rows] = 0.5 * np.log(filters.variance)
+        out = np.empty(len(self))
+        for s in self.series:
+            if not _is_slow(s):
+                out[s.start : s.stop] = 0.5 * np.log(np.square(s.white) + s.coloured**2)
+        for s, kalman in self._filters:
+            out[s.start : s.stop] = 0.5 * np.log(kalman.variance)
         return out
 
     def slow_variance(self) -> np.ndarray:
@@ -198,9 +201,10 @@ class Observations:
         """
         out = np.empty(len(self))
         for s in self.series:
-            out[s.start : s.stop] = s.coloured**2
-        for filters in self._slow:
-            out[filters.rows] = filters.gain * filters.variance
+            if not _is_slow(s):
+                out[s.start : s.stop] = s.coloured**2
+        for s, kalman in self._filters:
+            out[s.start : s.stop] = kalman.gain * kalman.variance
         return out
 
 
@@ -209,19 +213,18 @@ def _is_slow(s: Series) -> bool:
     return s.time is not None and s.coloured > 0.0 and s.correlation_time > 0.0
 
 
-def _kalman_filters(group: Sequence[Series]) -> KalmanFilters:
-    """Filters of a white noise plus an Ornstein-Uhlenbeck process, for series of one length."""
-    time = np.stack([np.asarray(s.time) for s in group])
-    white = np.stack([np.broadcast_to(np.square(s.white), s.stop - s.start) for s in group])
+def _kalman_filters(group: Sequence[Series]) -> list[KalmanFilter]:
+    """Filters of a white noise plus an Ornstein-Uhlenbeck process, for series that share their times."""
+    time = np.asarray(group[0].time)
+    white = np.stack([np.broadcast_to(np.square(s.white), time.shape) for s in group], axis=1)
     power = np.array([s.coloured**2 for s in group])
-    decay = np.exp(-np.diff(time, prepend=time[:, :1]) / np.array([[s.correlation_time] for s in group]))
+    decay = np.exp(-np.diff(time, prepend=time[0])[:, None] / np.array([s.correlation_time for s in group]))
     total, gain = np.empty_like(white), np.empty_like(white)
     # The process begins in its stationary state: nothing is known of its past.
     variance = power
-    for i in range(time.shape[1]):
-        variance = decay[:, i] ** 2 * variance + power * (1.0 - decay[:, i] ** 2)
-        total[:, i] = variance + white[:, i]
-        gain[:, i] = variance / total[:, i]
-        variance = (1.0 - gain[:, i]) * variance
-    rows = np.stack([np.arange(s.start, s.stop) for s in group])
-    return KalmanFilters(rows, total, decay, gain)
+    for i in range(len(time)):
+        variance = decay[i] ** 2 * variance + power * (1.0 - decay[i] ** 2)
+        total[i] = variance + white[i]
+        gain[i] = variance / total[i]
+        variance = (1.0 - gain[i]) * variance
+    return [KalmanFilter(total[:, k], decay[:, k], gain[:, k]) for k in range(len(group))]
