@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -70,9 +70,11 @@ class SearchSettings:
         """The usual settings but for some, given by name as numbers, lists or text.
 
         Raises:
-          UserError: no such setting, a value of another kind, below zero, or a probability above one.
+          UserError: no such setting, a value of another kind, below zero, a probability above one, or a list of
+            another length where that is fixed.
         """
         usual, values = dataclasses.asdict(cls()), {}
+        hints = get_type_hints(cls)
         for name, value in changed.items():
             if name not in usual:
                 raise bad_input("settings", name, value, "is not known", f"use one of {', '.join(usual)}")
@@ -80,8 +82,9 @@ class SearchSettings:
                 values[name] = _like(usual[name], value)
             except (TypeError, ValueError):
                 raise bad_input("settings", name, value, "has another kind", f"give it like {usual[name]}") from None
-            shares = isinstance(usual[name], tuple) and usual[name] and not isinstance(usual[name][0], str)
-            if shares and len(values[name]) != len(usual[name]):
+            # Levels that are tried are as many as one likes; shares of three shapes are three.
+            of = get_args(hints[name]) if isinstance(usual[name], tuple) else ()
+            if of and Ellipsis not in of and len(values[name]) != len(of):
                 raise bad_input("settings", name, value, "has another length", f"give it like {usual[name]}")
             # Sizes, shares, probabilities, odds and counts: none is below zero. Of odds and of a discrepancy's size the
             # logarithm is taken, and a length is divided by.

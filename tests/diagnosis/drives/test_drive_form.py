@@ -662,6 +662,14 @@ def test_nothing_unlisted_is_believed_before_what_was_seen_to_gain_had_its_refit
     assert _unlooked(quiet, quiet.sentence, found) == (quiet, quiet.sentence)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [("annealing", "", ()), ("noise_freedoms", "0", (0.0,)), ("error_times_s", "1,3,10", (1.0, 3.0, 10.0))],
+)
+def test_levels_that_are_tried_are_as_many_as_one_likes(name, text, value):
+    assert getattr(DriveSettings.of({name: text}), name) == value
+
+
 class Stopped(Toy):
     """A toy whose time can be over."""
 
