@@ -150,7 +150,7 @@ def answer_of(answer: Any) -> dict[str, Any]:
         "probability": {k: round(v, 4) for k, v in list(chance.items())[:6]},
         "inclusion": {k: round(v, 4) for k, v in inclusion[:6]},
         "ground_probability": round(sum(p for n, p in chance.items() if GROUND & set(n.split(" + "))), 4),
-        "held_out": answer.details.get("held_out_of_usual") or answer.details.get("held_out"),
+        "held_out": answer.details.get("held_out"),
         "discrepancy": {k: round(v["size"], 4) for k, v in answer.discrepancy.items()},
         "sentence": answer.sentence,
         "not_tried": len(answer.details.get("not_tried", [])),

@@ -175,6 +175,10 @@ class DriveForm(MeasuredForm):
         """See `Form`: by a race of all that may be missing beside a refit."""
         return self._refits.race(refit)
 
+    def under_errors_of(self, refit: Refit, other: Refit) -> Linear:
+        """See `MeasuredForm`: each set of effects has found errors of its own."""
+        return self._refits.under_errors_of(refit, other)
+
     def _first_refit(self) -> tuple[np.ndarray, Linear]:
         """Where (coordinates,) the model as it is ends, and what hypotheses need there; its errors are learnt."""
         beside = None if self._rival_of is None else self._rival_of.for_rival()

@@ -26,7 +26,7 @@ from lunar_mjx.diagnosis.runs import (
 from lunar_mjx.diagnosis.verdict import Diagnosis, EffectEvidence, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, helps, label, probabilities, title
 from lunar_mjx.diagnosis.weighed.form import MeasuredForm, Problem
-from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
+from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, Account, account, gains_on_held_out
 from lunar_mjx.files import replacing
 from lunar_mjx.inference.coordinates import FACTOR_UNIT
 from lunar_mjx.inference.deadline import TimeUp
@@ -326,8 +326,8 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
         conclusion, sentence = _unrefitted(conclusion, sentence, refitted, found.unchallenged)
     if skipped:
         conclusion, sentence = _without(conclusion, sentence, skipped)
-    held = account(_held_out(found, best, own))
-    conclusion, sentence, accounted = _held_to_account(conclusion, sentence, found, settings.held_out_sure)
+    held = account(gains_on_held_out(problem, found))
+    conclusion, sentence = _held_to_account(conclusion, sentence, held, settings.held_out_sure)
     inclusion = {t: p for t, p in found.inclusion().items() if t.name not in _estimates(found)}
     evidence, undecidable = _evidence(problem, found, conclusion.effects)
     return Diagnosis(
@@ -350,7 +350,6 @@ def _diagnosis(problem: Problem, found: ModelSearch, best: Hypothesis) -> Diagno
             "best": {"form": best.form, "hypothesis": title(best), "log_posterior": best.log_posterior},
             "place": conclusion.place,
             "held_out": held.to_dict("manoeuvres"),
-            **accounted,
             "noise": {n.name: float(s) for n, s in zip(best.refit.linear.noises, best.evidence.noise, strict=True)},
             "search": {
                 "refits": found.refits,
@@ -453,22 +452,22 @@ def _averaged(form: MeasuredForm, found: ModelSearch, least_signal: float) -> di
     return _discrepancy(form, np.asarray(tau), np.asarray(spread), found.best.refit.linear.felt(), least_signal)
 
 
-def _held_to_account(
-    said: Conclusion, sentence: str, found: ModelSearch, sure: float
-) -> tuple[Conclusion, str, dict[str, Any]]:
-    """A conclusion and its sentence where what it names does not help what was held out, and what that was measured by.
+def _held_to_account(said: Conclusion, sentence: str, held: Account, sure: float) -> tuple[Conclusion, str]:
+    """A conclusion and its sentence where what it names does not help what was held out.
 
     Drives that chose a name have bent it to whatever else is wrong there. One that says nothing of other drives is not
     known to be missing, nor is it known that it is not.
+
+    Args:
+      said, sentence: the conclusion. held: what it gains on what was held out.
+      sure: probability of a gain below which it is taken back; 0: never.
     """
     if not sure or said.verdict not in NAMING:
-        return said, sentence, {}
-    held = account(gains_on_held_out(found))
-    details = {"held_out_of_usual": held.to_dict("units")}
+        return said, sentence
     if held.units < FEWEST:
-        return said, sentence + " No drive was held out that could bear it out.", details
+        return said, sentence + " No drive was held out that could bear it out."
     if held.helps(sure):
-        return said, sentence, details
+        return said, sentence
     names = ", ".join([*said.effects, *(["something unlisted"] if said.unlisted else [])])
     sentence = (
         f"By the fitted drives alone: {sentence} Those that were held out do not bear it out (log density "
@@ -476,17 +475,7 @@ def _held_to_account(
         "otherwise."
     )
     taken_back = {"verdict": Verdict.UNDECIDABLE, "effects": (), "further": (), "unlisted": False, "port": None}
-    return dataclasses.replace(said, **taken_back, probability=0.0), sentence, details
-
-
-def _held_out(found: ModelSearch, best: Hypothesis, own: str) -> np.ndarray:
-    """(unit,) gain of log predictive density on what chose nothing: the best hypothesis over the model as it is."""
-    base = found.base(own)
-
-    def score(h: Hypothesis, name: str) -> float:
-        return h.refit.linear.log_score(name, h.evidence, h.places)
-
-    return np.array([score(best, n) - score(base, n) for n in best.refit.linear.held_out])
+    return dataclasses.replace(said, **taken_back, probability=0.0), sentence
 
 
 def _evidence(

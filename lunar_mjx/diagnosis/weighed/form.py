@@ -17,7 +17,7 @@ from lunar_mjx.errors import bad_input, require_within
 from lunar_mjx.inference.coordinates import Coordinate
 from lunar_mjx.inference.observations import Observations
 from lunar_mjx.inference.problem import NotTested
-from lunar_mjx.inference.weighing.hypotheses import Form, Refit
+from lunar_mjx.inference.weighing.hypotheses import Form, Linear, Refit
 from lunar_mjx.inference.weighing.search import LEAST_SIGNAL, UNLISTED_SHARE, Hypothesis
 
 SettingsKind = TypeVar("SettingsKind", bound="SearchSettings")
@@ -150,6 +150,15 @@ class MeasuredForm(Form):
         """What a form has learnt beside its parameters, for the record of a comparison; nothing by itself."""
         del refit
         return {}
+
+    def under_errors_of(self, refit: Refit, other: Refit) -> Linear:
+        """What hypotheses need around a refit with the errors of measurements that another has found, and without what
+        that one names: all that is usual, such as a little of every effect, is without it, too.
+
+        As it is where all refits have the same errors, and nothing usual holds an effect.
+        """
+        del other
+        return refit.linear
 
     def limit(self, until: float) -> None:
         """Ends simulations by a time of the monotonic clock, where they last: refits then raise `TimeUp`."""

@@ -33,7 +33,7 @@ from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import _diagnosis, _held_to_account, _unlooked, _unrefitted, _without
 from lunar_mjx.diagnosis.weighed.conclusion import Conclusion, conclude, helps
 from lunar_mjx.diagnosis.weighed.form import Problem, SearchSettings
-from lunar_mjx.diagnosis.weighed.held_to_account import account
+from lunar_mjx.diagnosis.weighed.held_to_account import account, gains_on_held_out
 from lunar_mjx.effects.catalogue import CATALOGUE
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.coordinates import Coordinate
@@ -256,7 +256,7 @@ def test_hypotheses_with_errors_of_their_own_are_weighed_in_the_same_units():
     drag, refits = frozenset({"drag"}), form._refits
     found = form.refit(drag, base, None)
     by_its_own = found.linear.evidence(form.listed(drag))[0]
-    _, slopes = refits.slopes[drag]
+    slopes = refits.ended[drag, found.u.tobytes()].slopes
     by_those_of_the_base = refits.linearised.around(found.u, drag, slopes).evidence(form.listed(drag))[0]
     plain = base.linear.evidence(frozenset())[0]
     assert plain < by_those_of_the_base <= by_its_own + 1.0
@@ -480,13 +480,44 @@ def test_a_name_has_to_help_drives_that_chose_nothing(everywhere: bool, verdict:
         held = toy.observations.in_split("select")
         without = Toy({}).observations.value
         toy.observations = dataclasses.replace(toy.observations, value=np.where(held, without, toy.observations.value))
-    _, found, said = asked(toy)
+    form, found, said = asked(toy)
     assert (said.verdict, said.effects) == (Verdict.KNOWN, ("drag",)), said.sentence
-    after, sentence, details = _held_to_account(said, said.sentence, found, 0.95)
+    problem = Problem((form,), {}, (), form.settings)
+    held = account(gains_on_held_out(problem, found))
+    assert held.units == 16
+    after, sentence = _held_to_account(said, said.sentence, held, 0.95)
     assert after.verdict is verdict
-    assert details["held_out_of_usual"]["units"] == 16
     assert (after.effects, "not named" in sentence) == ((("drag",), False) if everywhere else ((), True))
-    assert _held_to_account(said, said.sentence, found, 0.0) == (said, said.sentence, {})
+    assert _held_to_account(said, said.sentence, held, 0.0) == (said, said.sentence)
+
+
+def test_what_is_held_out_is_predicted_with_the_same_errors_with_and_without_a_name():
+    """How large errors are taken to be is nothing that an effect predicts: those of the better model are for both.
+
+    Here the refit with the effect takes held-out readings to be ten times as good as they are. By errors of its own it
+    would lose what it gains.
+    """
+    form, found, _ = asked(Toy({"drag": 0.9}))
+    problem = Problem((form,), {}, (), form.settings)
+    before, present = gains_on_held_out(problem, found), form.errors
+    best, base = found.best.refit, found.base(form.name).refit
+    ended = form._refits.ended
+    end = ended[best.effects, best.u.tobytes()]
+    seen = end.errors.plain
+    held = seen.in_split("select")
+    series = [dataclasses.replace(x, white=0.1 * x.white, chain=None) if held[x.start] else x for x in seen.series]
+    fine = dataclasses.replace(seen, series=tuple(series))
+    sure = dataclasses.replace(end.errors, plain=fine, single=0.0, log_ratio=0.0)
+    ended[best.effects, best.u.tobytes()] = dataclasses.replace(end, errors=sure)
+    linear = form.under_errors_of(best, best)
+    term = dataclasses.replace(found.best, refit=dataclasses.replace(best, linear=linear))
+    own = sum(linear.log_score(n, *linear.evidence(found.best.terms)[1:]) for n in linear.held_out)
+    plain = sum(base.linear.log_score(n, *base.linear.evidence(frozenset())[1:]) for n in base.linear.held_out)
+    assert own < plain, "each by its own errors"
+    too_sure = dataclasses.replace(found, hypotheses=(term, *found.hypotheses[1:]))
+    assert np.all(gains_on_held_out(problem, too_sure) > 0.0)
+    assert np.all(before > 0.0)
+    assert form.errors is present
 
 
 @pytest.mark.parametrize(
@@ -986,7 +1017,8 @@ def test_an_effect_is_credited_with_what_its_refit_has_reached():
     away = refit.u + np.eye(len(refit.u))[0]
     slopes = form.jacobian(away, form._own.prior.places.free(drag))[1]
     linear = form._refits.linearised
-    lavish, plain = (linear.around(away, drag, slopes, k).evidence(form.listed(drag))[0] for k in (7.0, 0.0))
+    around = linear.around(away, drag, slopes)
+    lavish, plain = (dataclasses.replace(around, unkept=k).evidence(form.listed(drag))[0] for k in (7.0, 0.0))
     assert lavish == pytest.approx(plain - 7.0)
 
 

@@ -26,6 +26,7 @@ from lunar_mjx.diagnosis.drives.windows.verbs import fitted_model
 from lunar_mjx.diagnosis.runs import Run
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed.conclusion import conclude
+from lunar_mjx.diagnosis.weighed.held_to_account import account
 from lunar_mjx.dynamics.imposed import Windows
 from lunar_mjx.errors import UserError
 from lunar_mjx.inference.weighing.hypotheses import EFFECT
@@ -498,19 +499,16 @@ def test_a_rover_on_free_rockers_is_refused_with_the_remedy(tmp_path):
         corners(hard_floor(tmp_path / "out"))
 
 
-def test_a_name_that_does_not_help_what_was_held_out_is_taken_back(monkeypatch):
+def test_a_name_that_does_not_help_what_was_held_out_is_taken_back():
     """Three windows of mixed gain refuse a name and keep its port; eight that all gain keep it."""
     named = Diagnosis(Verdict.KNOWN, ("soft_ground",), "soft_ground is missing.")
     families = {"soft_ground": "ground"}
-    monkeypatch.setattr(verbs, "gains_on_held_out", lambda found: np.array([3.0, -2.0, 1.0]))
-    said = verbs._held_to_account(named, None, families)
+    said = verbs._held_to_account(named, account(np.array([3.0, -2.0, 1.0])), families)
     assert said.verdict is Verdict.UNKNOWN
     assert (said.effects, said.port) == ((), "wheel_normal")
     assert "wheel_normal" in said.sentence
-    monkeypatch.setattr(verbs, "gains_on_held_out", lambda found: np.linspace(1.0, 3.0, 8))
-    assert verbs._held_to_account(named, None, families).verdict is Verdict.KNOWN
-    monkeypatch.setattr(verbs, "gains_on_held_out", lambda found: np.zeros(0))
-    assert verbs._held_to_account(named, None, families) is named
+    assert verbs._held_to_account(named, account(np.linspace(1.0, 3.0, 8)), families).verdict is Verdict.KNOWN
+    assert verbs._held_to_account(named, account(np.zeros(0)), families) is named
 
 
 def test_like_motions_share_what_a_law_is_off_by():

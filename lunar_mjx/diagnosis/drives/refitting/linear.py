@@ -29,15 +29,18 @@ class Linearised:
         kinds = [usual_kind(c) for c in prior.places.coordinates]
         self._instruments = {k: np.flatnonzero([kind == k for kind in kinds]) for k in dict.fromkeys(kinds) if k}
 
-    def around(self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray, unkept: float = 0.0) -> Linear:
+    def around(
+        self, u: np.ndarray, effects: frozenset[str], slopes: np.ndarray, without: frozenset[str] = frozenset()
+    ) -> Linear:
         """Everything that hypotheses need around a place (coordinates,) with some effects.
 
         Args:
-          u: the place. effects: those of the refit. slopes: (n, free) derivatives there. unkept: see `Linear`.
+          u: the place. effects: those of the refit. slopes: (n, free) derivatives there.
+          without: effects of which there is not even the little that is usual.
         """
         places, errors, settings = self._prior.places, self._errors, self._settings
         observations, count = errors.observations, len(places.coordinates)
-        design = self._design.columns(u, places.free(effects), slopes, effects)
+        design = self._design.columns(u, places.free(effects), slopes, effects | without)
         columns, residual = observations.whiten(design.derivatives), observations.whiten(design.residual)
         width = len(design.prior.std)
         low, high = np.full(width, -np.inf), np.full(width, np.inf)
@@ -71,7 +74,6 @@ class Linearised:
             far=1.0,
             amount=amplitude_columns(places.coordinates, width),
             freedom=settings.effect_freedom,
-            unkept=unkept,
             log_scale=errors.log_scale(),
             held_out_scale=scale,
         )

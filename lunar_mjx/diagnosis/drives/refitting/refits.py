@@ -11,7 +11,7 @@ import numpy as np
 from lunar_mjx.diagnosis.drives.problem import DriveProblem
 from lunar_mjx.diagnosis.drives.refitting.descent import Descent
 from lunar_mjx.diagnosis.drives.refitting.design import Design
-from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel
+from lunar_mjx.diagnosis.drives.refitting.errors import ErrorModel, Errors
 from lunar_mjx.diagnosis.drives.refitting.linear import Linearised
 from lunar_mjx.diagnosis.drives.refitting.own import Base, OwnRefit
 from lunar_mjx.diagnosis.drives.refitting.prior import Prior
@@ -19,6 +19,22 @@ from lunar_mjx.diagnosis.drives.refitting.race import Race
 from lunar_mjx.diagnosis.drives.refitting.settings import DRIVE_REFIT
 from lunar_mjx.diagnosis.drives.settings import DriveSettings
 from lunar_mjx.inference.weighing.hypotheses import EFFECT, Linear, Refit, Term
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _End:
+    """Where a refit has ended.
+
+    Attributes:
+      free: coordinates that were moved. slopes: (n, free) derivatives by them.
+      seen: (n, coordinates) those of `Design`.
+      errors: of the readings, as it has found them.
+    """
+
+    free: np.ndarray
+    slopes: np.ndarray
+    seen: np.ndarray
+    errors: Errors
 
 
 @dataclasses.dataclass(eq=False)
@@ -30,7 +46,7 @@ class Refits:
       prior: of what moves. errors: of the readings. terms: everything that may be the matter. settings: effort.
       own: refit of the model as it is. acting: the place (coordinates,) of another with an effect of some size.
       base: the refit of the model as it is by itself; None before.
-      slopes: coordinates and derivatives (n, free) by them at the end of each refit, by its effects.
+      ended: what is known of the end of each refit, by its effects and coordinates.
       raced: (coordinates,) where races have brought effects, by the effects beside which they ran, and their own.
     """
 
@@ -45,7 +61,7 @@ class Refits:
     own: OwnRefit
     acting: Callable[[np.ndarray, str], np.ndarray]
     base: Base | None = None
-    slopes: dict[frozenset[str], tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    ended: dict[tuple[frozenset[str], bytes], _End] = dataclasses.field(default_factory=dict)
     raced: dict[tuple[frozenset[str], frozenset[str]], np.ndarray] = dataclasses.field(default_factory=dict)
 
     def begin(self, base: Base) -> tuple[np.ndarray, Linear]:
@@ -91,7 +107,7 @@ class Refits:
           EvidenceError: nothing can be told of where it stands. TimeUp: before all had run.
         """
         assert self.base is not None
-        free, slopes = self.slopes[refit.effects]
+        end = self.ended[refit.effects, refit.u.tobytes()]
         shows = refit.linear.shows()
         wanted = {e for e in shows if shows[e] >= self.settings.least_signal} - refit.effects
         with self.own.apart(self.base), self.own.under_large_errors():
@@ -99,11 +115,25 @@ class Refits:
             # By slopes of where the model stands, a little of every effect would stand in for what one does elsewhere:
             # on a foreign Husky the hidden slip-sinkage lost 5,587 nats beside it, and gains 1,294 without.
             self.design.seen[:, self.prior.places.amplitudes(self.prior.places.candidates)] = 0.0
-            race = Race(self.own, self.descent, self.settings.longest_step, free, slopes, refit.u)
+            race = Race(self.own, self.descent, self.settings.longest_step, end.free, end.slopes, refit.u)
             groups = [[n for n in part if n in wanted] for part in self.own.signatures.parts]
             gains = race.run([names for names in groups if names], self.acting)
         self.raced |= {(refit.effects, frozenset({e})): u for e, u in race.ends.items()}
         return gains
+
+    def under_errors_of(self, refit: Refit, other: Refit) -> Linear:
+        """What hypotheses need around a refit, with the errors of readings that another one has found, and without even
+        a little of what that one names.
+
+        Args:
+          refit, other: of this form. Errors of the present are left as they are.
+        """
+        assert self.base is not None
+        end, found = (self.ended[r.effects, r.u.tobytes()] for r in (refit, other))
+        with self.own.apart(self.base):
+            self.errors.present, self.design.seen = found.errors, end.seen
+            self.drives.about(refit.u)
+            return self.linearised.around(refit.u, refit.effects, end.slopes, other.effects)
 
     def _weighed(self, u: np.ndarray, effects: frozenset[str], free: np.ndarray, slopes: np.ndarray) -> Linear:
         """What hypotheses need around the place (coordinates,) of a refit, by its own derivatives and errors."""
@@ -112,7 +142,7 @@ class Refits:
         found = linear.evidence(self._listed(effects), self.base.sizes if self.base else None)[1]
         sizes = self.prior.fields.led_by((found.tau, found.noise))
         cost = self.descent.cost(u, free, sizes, self.prior.places.inputs(free, slopes))
-        self.slopes[effects] = free, slopes
+        self.ended[effects, u.tobytes()] = _End(free, slopes, self.design.seen.copy(), self.errors.present)
         promise = self.descent.promise(cost, u, free, slopes)
         return dataclasses.replace(linear, unkept=0.5 * max(promise - self.settings.settled, 0.0))
 
@@ -138,7 +168,7 @@ class Refits:
         A refit that leaves much to discrepancy may predict worse without it than the model as given does.
         """
         places, errors, std = self.prior.places, self.errors, self.prior.std
-        free = self.slopes[refit.effects][0]
+        free = self.ended[refit.effects, refit.u.tobytes()].free
         free = free[self.prior.field_of[free] < 0]
         fitted = places.bare(refit.u)
         given = fitted.copy()

@@ -23,12 +23,11 @@ from lunar_mjx.diagnosis.runs import COMPARISON_FILE, FITTED_FILE, VERDICT_FILE,
 from lunar_mjx.diagnosis.verdict import Diagnosis, Verdict
 from lunar_mjx.diagnosis.weighed import answer
 from lunar_mjx.diagnosis.weighed.form import Problem
-from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, account, gains_on_held_out
+from lunar_mjx.diagnosis.weighed.held_to_account import FEWEST, NAMING, Account, account, gains_on_held_out
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.evidence import EvidenceError
 from lunar_mjx.inference.fitting import Progress, silent
 from lunar_mjx.inference.weighing.hypotheses import Refit
-from lunar_mjx.inference.weighing.search import ModelSearch
 from lunar_mjx.logs import Log
 from lunar_mjx.logs.schema import find_channel
 from lunar_mjx.model import Model
@@ -305,7 +304,8 @@ def why(
         run.save(COMPARISON_FILE, comparison(bench, question, start, base, alone, time.monotonic() - begin))
         tried = {tuple(sorted(h.effects)): h.refit.u for h in found.hypotheses if h.refitted and h.effects}
         write_refits(run.folder, {e: (form.told(u), form.predicted(u)) for e, u in tried.items()})
-        diagnosis = _held_to_account(diagnosis, found, {s.name: s.family for s in bench.suspects})
+        held = account(gains_on_held_out(question, found))
+        diagnosis = _held_to_account(diagnosis, held, {s.name: s.family for s in bench.suspects})
         untold = not_told(form, base, diagnosis.effects)
         sentence = diagnosis.sentence
         if diagnosis.verdict in (Verdict.UNKNOWN, Verdict.UNDECIDABLE, Verdict.KNOWN_CLASS):
@@ -343,17 +343,12 @@ PORTS = {
 """The port at which a family of suspects acts."""
 
 
-def _held_to_account(diagnosis: Diagnosis, found: ModelSearch, families: Mapping[str, str]) -> Diagnosis:
+def _held_to_account(diagnosis: Diagnosis, held: Account, families: Mapping[str, str]) -> Diagnosis:
     """The diagnosis, or UNKNOWN where what it names does not help held-out windows with 95 %.
 
     Where fewer than two windows were held out, nothing is refused.
     """
-    held = account(gains_on_held_out(found))
-    if diagnosis.verdict not in NAMING or held.units < FEWEST:
-        return diagnosis
-    details = {**diagnosis.details, "held_out_of_usual": held.to_dict("windows")}
-    diagnosis = dataclasses.replace(diagnosis, details=details)
-    if held.helps(TELLING.sure):
+    if diagnosis.verdict not in NAMING or held.units < FEWEST or held.helps(TELLING.sure):
         return diagnosis
     names = ", ".join([*diagnosis.effects, *(["something unlisted"] if diagnosis.unlisted else [])])
     sentence = (
