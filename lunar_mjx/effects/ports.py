@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 from typing import Annotated, Any
 
@@ -22,6 +23,7 @@ from lunar_mjx.effects.context import (
     Soil,
     WheelForce,
 )
+from lunar_mjx.effects.marks import by_wheel
 from lunar_mjx.effects.wheel.closed_form import lateral_slip_speed
 from lunar_mjx.effects.wheel.rim_contact import fitted_plane
 from lunar_mjx.pytree import pytree
@@ -222,6 +224,21 @@ def wheel_ports(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[C
     return dataclasses.replace(ctx, wheel=wheel), state
 
 
+def _wheels(pipeline: Pipeline, ctx: Context, state: EffectState) -> tuple[Any, ...]:
+    """What the ground does to the wheels.
+
+    Returns:
+      Contact, soil, normal and shear of every wheel, its force, N, and moment, N m, in world coordinates, and the
+      effects' new state.
+    """
+    ctx, state = wheel_ports(pipeline, dataclasses.replace(ctx, contact=wheel_contact(ctx)), state)
+    # Forces are found in the wheel's frame, where the laws are stated, and turned into the world once, for all laws.
+    contact, wheel = ctx.contact, ctx.wheel
+    assert contact is not None and wheel is not None
+    frame = Frame(contact.forward, contact.left, contact.normal)
+    return contact, ctx.soil, ctx.normal, wheel, frame.to_world(wheel.force), frame.to_world(wheel.moment), state
+
+
 def apply_effects(
     pipeline: Pipeline, ctx: Context, control: Any, state: EffectState
 ) -> tuple[Forces, Context, EffectState]:
@@ -236,8 +253,9 @@ def apply_effects(
     # Only from here on: the motor's law does not know gravity, but contact, soil and bulldozing do.
     if geometry.gravity is not None:
         ctx = dataclasses.replace(ctx, gravity=geometry.gravity)
-    ctx = dataclasses.replace(ctx, contact=wheel_contact(ctx))
-    ctx, state = wheel_ports(pipeline, ctx, state)
+    met = functools.partial(_wheels, pipeline, ctx, state)
+    contact, soil, normal, wheel, wheel_force, wheel_moment, state = by_wheel(met, len(ctx.steering_angle))
+    ctx = dataclasses.replace(ctx, contact=contact, soil=soil, normal=normal, wheel=wheel)
     zero = jnp.zeros_like(ctx.position.x)
     none = Vec3(zero, zero, zero)
     wrench, state = pipeline.run("body_wrench", ctx, state, BodyWrench(none, none, jnp.zeros_like(ctx.joint_angle)))
@@ -245,14 +263,10 @@ def apply_effects(
     if "power" in pipeline:
         power, state = pipeline.run("power", ctx, state, Power(zero, zero, zero))
         ctx = dataclasses.replace(ctx, power=power)
-    # Forces are found in the wheel's frame, where the laws are stated, and turned into the world once, for all laws.
-    contact, wheel = ctx.contact, ctx.wheel
-    assert contact is not None and wheel is not None
-    wheel_frame = Frame(contact.forward, contact.left, contact.normal)
     forces = Forces(
         joint_torque=torque + wrench.joint_torque,
-        wheel_force=wheel_frame.to_world(wheel.force),
-        wheel_moment=wheel_frame.to_world(wheel.moment),
+        wheel_force=wheel_force,
+        wheel_moment=wheel_moment,
         chassis_force=wrench.force,
         chassis_moment=wrench.moment,
         geometry=geometry,

@@ -16,11 +16,16 @@ import jax.numpy as jnp
 
 from lunar_mjx.dynamics.batching.batch_last import batch_last
 from lunar_mjx.dynamics.batching.computed_once import computed_once
+from lunar_mjx.dynamics.batching.cuda import Launch, compiler, on_gpu
+from lunar_mjx.dynamics.batching.one_kernel import as_kernels
 from lunar_mjx.dynamics.state import Params, State, Telemetry
 from lunar_mjx.errors import UserError
 
 CHUNK = {"cpu": 1024, "gpu": 65536}
 """Rovers per chunk by platform (benchmarks/speed.py): the state of a chunk stays in the L2 cache."""
+
+PARTS: list[Launch] = []
+"""How marked parts of a step run as kernels; where it is empty, on a GPU by its compiler, and elsewhere not at all."""
 
 Axes = Any
 """None, 0, or a prefix of `Params` whose leaves are None (shared by all rovers) or 0 (leading axis: per rover)."""
@@ -47,7 +52,7 @@ def step_batch(
     """One step of many rovers; see `System.step_batch`."""
 
     def step(params: Params, axes: list[int | None], state: State, control: Any) -> Any:
-        return _once(system, batch_last(system.step, (axes, -1, -1)))(params, state, control)
+        return _once(system, batch_last(system.step, (axes, -1, -1), _parts()))(params, state, control)
 
     return _in_chunks(step, params, params_axes, (state, control), chunk)
 
@@ -69,15 +74,15 @@ def rollout_batch(
     controls = jnp.asarray(controls)
 
     def drive(params: Params, axes: list[int | None], state: State, *own: Any) -> Any:
-        step = batch_last(system.step, (axes, -1, -1 if own else None))
-        engine = system.engine
+        each, engine = (axes, -1, -1 if own else None), system.engine
 
         def reporting(params: Params, now: State, control: Any) -> tuple[State, Any]:
-            new, telemetry = step(params, now, control)
+            new, telemetry = system.step(params, now, control)
             return new, keep(telemetry)
 
-        run = _once(system, reporting)
-        silent = _once(system, lambda params, now, control: step(params, now, control)[0])
+        # What is kept of the telemetry is chosen within, so that a part's kernel writes nothing else of it.
+        run = _once(system, batch_last(reporting, each, _parts()))
+        silent = _once(system, batch_last(lambda p, now, control: system.step(p, now, control)[0], each, _parts()))
 
         def recast(change: Callable[..., Any], state: State) -> State:
             qpos, qvel = batch_last(change, (-1, -1))(state.qpos, state.qvel)
@@ -109,6 +114,13 @@ def rollout_batch(
         return recast(engine.join, end), kept
 
     return _in_chunks(drive, params, params_axes, (state, controls) if controls.ndim == 3 else (state,), chunk)
+
+
+def _parts() -> Callable[..., Any] | None:
+    """How marked parts of a step are computed, for `batch_last`."""
+    if PARTS:
+        return as_kernels(PARTS[0])
+    return as_kernels(on_gpu) if jax.default_backend() == "gpu" and compiler() is not None else None
 
 
 def _once(system: Steps, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
+from lunar_mjx.effects.marks import BY_WHEEL
+
 _ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
     "convert_element_type", "copy", "copy_p", "cos", "cosh", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp",
@@ -23,15 +25,21 @@ _ELEMENTWISE = {
     "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow", "real", "rem", "round", "rsqrt", "select_n",
     "sign", "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
+Inline = Callable[..., list[tuple[Any, int | None]]]
+"""How an equation is computed without a kernel: from it, its operands, their batch axes and which results are wanted,
+to the results with their batch axes."""
 INLINE = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
 
 
-def batch_last(function: Callable[..., Any], in_axes: tuple[Any, ...]) -> Callable[..., Any]:
+def batch_last(
+    function: Callable[..., Any], in_axes: tuple[Any, ...], part: Callable[..., Any] | None = None
+) -> Callable[..., Any]:
     """Maps a function of one rover over the last axis of its arguments; the results have the batch axis last.
 
     Args:
       function: a pure function of pytrees of arrays.
       in_axes: for each argument None (shared), -1 (batch last), 0 (batch first), or a list of those, one per leaf.
+      part: how parts that `marks` marks are computed (`one_kernel.as_kernels`); None: like the rest.
 
     Returns:
       The batched function.
@@ -50,8 +58,8 @@ def batch_last(function: Callable[..., Any], in_axes: tuple[Any, ...]) -> Callab
         )
         size = next(leaf.shape[a] for leaf, a in zip(leaves, flat_axes, strict=True) if a is not None)
         values = [_Value(leaf, a) for leaf, a in zip(leaves, flat_axes, strict=True)]
-        out = _run(closed.jaxpr, closed.consts, values)
-        return jax.tree.unflatten(jax.tree.structure(shapes), [_at_end(v, size) for v in out])
+        out = _run(closed.jaxpr, closed.consts, values, [True] * len(closed.jaxpr.outvars), part)
+        return jax.tree.unflatten(jax.tree.structure(shapes), [at_end(v.array, v.axis, size) for v in out])
 
     return batched
 
@@ -75,33 +83,55 @@ def _without(shape: tuple[int, ...], axis: int) -> tuple[int, ...]:
     return shape[:axis] + shape[axis + 1 :]
 
 
-def _at_end(value: _Value, size: int) -> Any:
-    if value.axis is None:
-        return jnp.broadcast_to(jnp.asarray(value.array)[..., None], (*jnp.shape(value.array), size))
-    return jnp.moveaxis(value.array, value.axis, -1)
+def at_end(array: Any, axis: int | None, size: int) -> Any:
+    """An array with its batch axis, of length `size`, last; what is shared (axis None) is repeated."""
+    if axis is None:
+        return jnp.broadcast_to(jnp.asarray(array)[..., None], (*jnp.shape(array), size))
+    return jnp.moveaxis(array, axis, -1)
 
 
-def _run(jaxpr: Any, consts: Any, args: list[_Value]) -> list[_Value]:
-    """Evaluates a jaxpr, equation by equation."""
-    env: dict[Any, _Value] = {}
+def wanted(jaxpr: Any, live: list[bool]) -> set[Any]:
+    """The variables that lead to those results of a jaxpr that `live` names."""
+    found = {v for v, wants in zip(jaxpr.outvars, live, strict=True) if wants and not isinstance(v, core.Literal)}
+    for eqn in reversed(jaxpr.eqns):
+        if any(v in found for v in eqn.outvars):
+            found.update(v for v in eqn.invars if not isinstance(v, core.Literal))
+    return found
 
-    def read(atom: Any) -> _Value:
-        return _Value(atom.val, None) if isinstance(atom, core.Literal) else env[atom]
+
+def _run(jaxpr: Any, consts: Any, args: list[Any], live: list[bool], part: Any) -> list[Any]:
+    """Evaluates a jaxpr, equation by equation; results that are not `live` may be None."""
+    env: dict[Any, Any] = {}
+
+    def read(atom: Any) -> Any:
+        return _Value(atom.val, None) if isinstance(atom, core.Literal) else env.get(atom)
 
     env.update(zip(jaxpr.constvars, (_Value(c, None) for c in consts), strict=True))
     env.update(zip(jaxpr.invars, args, strict=True))
+    needed = wanted(jaxpr, live)
     for eqn in jaxpr.eqns:
-        operands = [read(v) for v in eqn.invars]
-        env.update(zip(eqn.outvars, _apply(eqn, operands), strict=True))
+        wants = [v in needed for v in eqn.outvars]
+        if any(wants):
+            env.update(zip(eqn.outvars, _apply(eqn, [read(v) for v in eqn.invars], wants, part), strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _apply(eqn: Any, operands: list[_Value]) -> list[_Value]:
+def _inline(eqn: Any, arrays: list[Any], axes: list[int | None], live: list[bool]) -> list[tuple[Any, int | None]]:
+    inner = eqn.params[INLINE[eqn.primitive.name]]
+    found = _run(inner.jaxpr, inner.consts, [_Value(*pair) for pair in zip(arrays, axes, strict=True)], live, None)
+    return [(None, None) if value is None else (value.array, value.axis) for value in found]
+
+
+def _apply(eqn: Any, operands: list[Any], live: list[bool], part: Any) -> list[Any]:
     name = eqn.primitive.name
     # Calls are opened up: a rule can only see an elementwise operation that is not hidden in a function.
     if name in INLINE:
+        if part is not None and str(eqn.params.get("name")).startswith(BY_WHEEL):
+            done = part(eqn, [o.array for o in operands], [o.axis for o in operands], live, _inline)
+            if done is not None:
+                return [None if array is None else _Value(array, -1) for array in done]
         inner = eqn.params[INLINE[name]]
-        return _run(inner.jaxpr, inner.consts, operands)
+        return _run(inner.jaxpr, inner.consts, operands, live, part)
     # What no batched value enters is computed once for the batch.
     if all(o.axis is None for o in operands):
         out = bind(eqn, [o.array for o in operands])
@@ -175,7 +205,7 @@ def _slice(eqn: Any, operands: list[_Value]) -> Any:
 
 def _concatenate(eqn: Any, operands: list[_Value]) -> Any:
     size = next(o.array.shape[-1] for o in operands if o.axis is not None)
-    return lax.concatenate([_at_end(o, size) for o in operands], eqn.params["dimension"])
+    return lax.concatenate([at_end(o.array, o.axis, size) for o in operands], eqn.params["dimension"])
 
 
 def _gather(eqn: Any, operands: list[_Value]) -> Any:
