@@ -83,6 +83,9 @@ def on_this_processor(tmp_path):
 )
 def test_the_kernel_drives_as_arrays_do(rover, preset, on_this_processor):
     model = make_model(rover, preset=preset)
+    if preset == "consistent":
+        # the part alone that makes the kernel worth it
+        model = model.add("stress_integral")
     system = build(model, "structured")
     along = jnp.linspace(-5.0, 5.0, 5)
     state = jax.jit(jax.vmap(lambda x: system.reset(system.params, x, 0.6 * x)))(along)
@@ -144,8 +147,21 @@ def test_loops_sums_and_lists_that_move_give_what_arrays_give(tmp_path):
 def test_derivatives_are_those_of_the_arrays(tmp_path):
     launch = OnThisProcessor(tmp_path)
     x = np.linspace(0.1, 2.0, 12, dtype=np.float32).reshape(3, 4)
-    slope = jax.grad(lambda x: jnp.sum(mapped(lambda x: jnp.sin(x) * x, launch, x)))(x)
-    np.testing.assert_allclose(slope, np.cos(x) * x + np.sin(x), rtol=1e-5)
+    share = np.linspace(0.0, 1.0, 16, dtype=np.float32)
+
+    def function(x):
+        return jnp.sum(jnp.sin(share[:, None] * x), axis=0)
+
+    assert np.asarray(mapped(function, launch, x)).shape == (3, 4) and len(launch.kernels) == 1
+    slope = jax.grad(lambda x: jnp.sum(mapped(function, launch, x)))(x)
+    np.testing.assert_allclose(slope, (share * np.cos(share * x[..., None])).sum(-1), rtol=1e-5)
+
+
+def test_a_part_without_loops_stays_with_xla(tmp_path):
+    launch = OnThisProcessor(tmp_path)
+    x = np.linspace(0.1, 2.0, 12, dtype=np.float32).reshape(3, 4)
+    np.testing.assert_allclose(mapped(jnp.sin, launch, x), np.sin(x), rtol=1e-6)
+    assert not launch.kernels
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,7 @@ class Kernel:
 Launch = Callable[[Kernel, list[Any], list[Any]], list[Any]]
 """Runs a kernel on its operands; gets the shapes and types of its results, and returns them."""
 
+_LOG = logging.getLogger(__name__)
 _HEAD = """
 #if __CUDA_ARCH__ >= 800
 #define LIKE(name, op) static __device__ float name(float a, float b) { \\
@@ -196,7 +197,11 @@ def _power(base: str, exponent: int) -> str:
 def on_gpu(kernel: Kernel, given: list[Any], outs: list[Any]) -> list[Any]:
     """Runs a kernel on the GPU: the results, whose shapes and types are `outs`."""
     device = jax.local_devices(backend="gpu")[0]
-    ptx = compiled(kernel.source, f"compute_{str(device.compute_capability).replace('.', '')}")
+    try:
+        ptx = compiled(kernel.source, f"compute_{str(device.compute_capability).replace('.', '')}")
+    except RuntimeError as error:
+        _LOG.warning("%s; XLA computes what the ground does to wheels, in more time.", error)
+        raise Uncompilable from error
     run = jax.ffi.ffi_call("__gpu$xla.gpu.ptx", outs, input_output_aliases=dict(kernel.kept), vmap_method="sequential")
     sizes = {"grid_x": math.ceil(kernel.batch / kernel.side), "grid_y": 1, "grid_z": 1}
     sizes |= {"block_x": kernel.side, "block_y": kernel.rows, "block_z": 1, "shared_mem_bytes": 0}
@@ -216,7 +221,7 @@ def compiler() -> Any:
                 return ctypes.CDLL(name)
             except OSError:
                 continue
-    logging.getLogger(__name__).info("no NVRTC found: XLA computes what the ground does to wheels, in more time.")
+    _LOG.info("no NVRTC found: XLA computes what the ground does to wheels, in more time.")
     return None
 
 
