@@ -116,7 +116,9 @@ def view(
     replay: Annotated[
         Path | None, typer.Option(help="Run folder of a drive: the measured rover beside the model's, as a ghost.")
     ] = None,
-    log: Annotated[str, typer.Option(help="Which of the run's logs to replay; the first by default.")] = "",
+    log: Annotated[
+        str, typer.Option(help="Which of the run's logs to replay; by default the first, or all windows.")
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Of a policy's episodes.")] = 0,
     engine: Annotated[
         str, typer.Option(help="native (starts at once), structured, mjx; auto: native where it has every effect.")

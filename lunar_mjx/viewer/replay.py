@@ -82,6 +82,7 @@ class Replay:
     Args:
       model: brings rover and ground. title: of the drive.
       measured: the course as measured. predicted: that of each model. traces: channels, one line for each model.
+      parts: when each part of the drive begins, s, and its title, where it was put together of several.
 
     Attributes:
       scene: what the page plays back: times, bodies of both rovers, traces. models: how many predict the drive.
@@ -90,7 +91,13 @@ class Replay:
     live = False
 
     def __init__(
-        self, model: Model, title: str, measured: Course, predicted: Sequence[Course], traces: Sequence[Trace]
+        self,
+        model: Model,
+        title: str,
+        measured: Course,
+        predicted: Sequence[Course],
+        traces: Sequence[Trace],
+        parts: Sequence[tuple[float, str]] = (),
     ) -> None:
         self.model, self.pilot, self.rate, self.path = model, Onlooker(), 1.0, 0.0
         # Evenly, whatever the log's own times: the page plays one picture after another.
@@ -105,6 +112,7 @@ class Replay:
         self.scene: dict[str, Any] = {
             "replay": {
                 "title": title,
+                "parts": [{"begin": round(begin, 4), "title": name} for begin, name in parts],
                 "dusty": any(dust is not None for dust in (self._measured, *self._models)),
                 "time": time.round(4).tolist(),
                 "measured": _packed(stand.bodies(measured, time)),
@@ -161,6 +169,9 @@ class _Stand:
         self._height = rover.standing_height
         self._reach = REPLAY_SIZES.foot * float(np.abs(np.asarray(rover.chassis_points)[:, :2]).max())
         self._drives = {w.drive: w.radius for w in rover.wheels}
+        mujoco.mj_kinematics(self._mj, self._data)
+        # Where a wheel is not steered, turning moves it along its rolling by its place to the left, m.
+        self._aside = {w.drive: 0.0 if w.steer else float(self._data.body(w.body).xpos[1]) for w in rover.wheels}
         self._steers = [w.steer for w in rover.wheels if w.steer is not None]
 
     def bodies(self, course: Course, time: np.ndarray) -> np.ndarray:
@@ -205,7 +216,7 @@ class _Stand:
         way = np.cumsum((step * ahead).sum(axis=-1))
         qpos = np.tile(self._mj.qpos0, (len(time), 1))
         qpos[:, :7] = self._standing(np.stack([x, y], axis=-1), ahead)
-        turned = {joint: way / radius for joint, radius in self._drives.items()}
+        turned = {j: (way - self._aside[j] * (yaw - yaw[0])) / radius for j, radius in self._drives.items()}
         turned |= {joint: then(*angle) for joint, angle in course.joints.items()}
         for joint, angle in turned.items():
             qpos[:, int(self._mj.joint(joint).qposadr[0])] += angle

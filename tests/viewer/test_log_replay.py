@@ -103,6 +103,116 @@ def test_what_cannot_be_replayed_is_said(tmp_path):
         replayed(folder)
 
 
+def write_windows(folder: Path, speed_measured: bool = True) -> Path:
+    """A run of imposed wheel speeds: two windows of a straight drive that is cut by a pause, and one of a turn.
+
+    The model as given is a tenth too fast, and turns at half the rate.
+    """
+    folder.mkdir()
+    save_model(make_model("husky", "flat"), folder / "model.toml")
+    at, ones = 0.1 * np.arange(20), np.ones(20)
+    straight, turn = np.concatenate([5.0 + at, 9.0 + at]), at
+    ahead, gyro = "body_velocity_x_m_s" if speed_measured else "motor_left_drive_current_A", "gyro_z_rad_s"
+    # (log, channel, times, measured, predicted as given)
+    series = [
+        (0, ahead, straight, 0.5 * np.tile(ones, 2), 0.55 * np.tile(ones, 2)),
+        (0, gyro, straight, 0.0 * straight, 0.0 * straight),
+        (2, ahead, turn[3::4], 0.5 * ones[3::4], 0.5 * ones[3::4]),
+        (2, gyro, turn, 0.4 * ones, 0.2 * ones),
+    ]
+    measured, given = (np.concatenate([s[k] for s in series]) for k in (3, 4))
+    n = len(measured)
+    predicted = np.stack([given, measured])
+    np.savez_compressed(
+        folder / "series.npz",
+        measured=measured,
+        sigma=np.full(n, 0.1),
+        time=np.concatenate([s[2] for s in series]),
+        place=np.zeros((0, 3)),
+        unit=np.concatenate([np.full(len(s[2]), min(s[0], 1)) for s in series]),
+        unit_names=np.array(["straight", "turn"]),
+        split=np.array(["fit", "test"]),
+        series_start=np.cumsum([0] + [len(s[2]) for s in series[:-1]]),
+        series_channel=np.array([s[1] for s in series]),
+        series_log=np.array([s[0] for s in series]),
+        logs=np.array(["straight", "unused", "turn"]),
+        labels=np.array(["as given", "refitted"]),
+        predicted=predicted,
+        residual=(measured - predicted) / 0.1,
+    )
+    used = [("straight", 5.0, "fit"), ("straight", 9.0, "fit"), ("turn", 0.0, "test")]
+    windows = {
+        "window_s": 2.0,
+        "interval_s": 0.1,
+        "used": [{"log": log, "start_s": start, "split": split} for log, start, split in used],
+    }
+    (folder / "windows.json").write_text(json.dumps(windows), encoding="utf-8")
+    run = {"format": "lunar-mjx-run/1", "logs": ["gone"], "hashes": {}, "added": []}
+    (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
+    return folder
+
+
+def test_windows_of_imposed_speeds_are_shown_one_after_another(tmp_path):
+    folder = write_windows(tmp_path / "run")
+    shown = replayed(folder)
+    told = shown.scene["replay"]
+    assert [p["title"] for p in told["parts"]] == [
+        "straight, from 5.0 s",
+        "straight, from 9.0 s",
+        "turn, from 0.0 s, held out",
+    ]
+    assert [p["begin"] for p in told["parts"]] == [0.0, 2.0, 4.0]
+    time = np.array(told["time"])
+    chassis = shown.model.rover.compile().body(shown.model.rover.chassis).id
+    measured = _bodies(told["measured"], len(time))[:, chassis, :2]
+    given, refitted = (_bodies(m["bodies"], len(time))[:, chassis, :2] for m in told["models"])
+    apart = np.hypot(*(given - measured).T)
+    # 1.9 s at 0.5 m/s a window, and from there on; the model sets out at the measured place again
+    for end, way in ((1.9, 0.95), (3.9, 1.9)):
+        at = np.abs(time - end).argmin()
+        assert measured[at, 0] - measured[0, 0] == pytest.approx(way, abs=0.01)
+        assert apart[at] == pytest.approx(0.095, abs=0.01)
+    assert apart[np.abs(time - 2.0).argmin()] < 0.01 and apart[np.abs(time - 4.0).argmin()] < 0.01
+    # an arc of 0.5 / 0.4 m through 0.76 rad, of which the model turned half
+    angle = 0.4 * 1.9
+    end = 1.25 * np.array([np.sin(angle), 1.0 - np.cos(angle)])
+    np.testing.assert_allclose(measured[-1] - measured[np.abs(time - 4.0).argmin()], end, atol=0.01)
+    assert apart[-1] > 0.1 and np.hypot(*(refitted - measured).T).max() < 1e-6
+    trace = next(t for t in told["traces"] if t["label"].startswith("gyro"))
+    # a gap between windows, so that no line joins them
+    assert len(trace["time"]) == 63 and [i for i, v in enumerate(trace["measured"]) if v is None] == [20, 41, 62]
+    alone = replayed(folder, "turn").scene["replay"]
+    assert [p["title"] for p in alone["parts"]] == ["turn, from 0.0 s, held out"] and alone["time"][-1] == 1.9
+
+
+def test_wheels_of_a_turn_on_the_spot_roll_against_each_other():
+    model = make_model("husky", "flat")
+    time = np.linspace(0.0, 2.0, 21)
+    course = Course("spin", time, 0.0 * time, 0.0 * time, 0.5 * time)
+    told = Replay(model, "spin", course, [course], []).scene["replay"]
+    spun = _bodies(told["measured"], len(told["time"]))
+    mj = model.rover.compile()
+    turned = {}
+    for wheel in model.rover.wheels:
+        body = mj.body(wheel.body).id
+        w, _, y, _ = spun[5, body, 3:]
+        turned[wheel.side] = float(2.0 * np.arctan2(y, w))
+    assert turned["left"] < -0.01 and turned["right"] > 0.01
+
+
+def test_windows_that_tell_no_way_are_refused_in_a_sentence(tmp_path):
+    with pytest.raises(UserError, match=r"nor in windows a speed ahead and a yaw rate; .*lunar-mjx studio"):
+        replayed(write_windows(tmp_path / "currents", speed_measured=False))
+    folder = write_windows(tmp_path / "run")
+    with pytest.raises(UserError, match="use one of straight, turn"):
+        replayed(folder, "unused")
+    content = json.loads((folder / "windows.json").read_text(encoding="utf-8"))
+    del content["used"][0]["start_s"]
+    (folder / "windows.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(UserError, match=r"windows\.json: is damaged \(used\.0\.start_s"):
+        replayed(folder)
+
+
 def _straight(slip: float, speed: float = 0.5, noise: float = 0.0, seed: int = 0, without: str = "") -> Course:
     """Ten seconds straight ahead with wheels that are known to turn faster than they roll, places off by some noise."""
     rover = load_rover("luvmi_x")

@@ -108,11 +108,24 @@ class _Refit(_Stored):
     u: dict[str, Number]
 
 
+class _Window(_Stored):
+    log: str
+    start_s: Number
+    split: Split
+
+
+class _Windows(_Stored):
+    window_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    interval_s: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    used: list[_Window]
+
+
 _SCHEMAS: dict[str, TypeAdapter[Any]] = {
     "run.json": TypeAdapter(_Run),
     "comparison.json": TypeAdapter(_Comparison),
     "verdict.json": TypeAdapter(_Verdict),
     "hypotheses.json": TypeAdapter(dict[str, _Refit]),
+    "windows.json": TypeAdapter(_Windows),
 }
 _ANY: TypeAdapter[Any] = TypeAdapter(dict[str, Any])
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from lunar_mjx.diagnosis.folder.stored import read_stored
 from lunar_mjx.diagnosis.report.read import Result, Traces, read_result
+from lunar_mjx.diagnosis.report.windowed import rows_of, way_of, windows_of
 from lunar_mjx.diagnosis.report.words import channel_label
+from lunar_mjx.diagnosis.runs import WINDOWS_FILE
 from lunar_mjx.errors import UserError, bad_input
 from lunar_mjx.inference.observations import Series
 from lunar_mjx.rover import Rover
@@ -23,27 +27,40 @@ def replayed(folder: str | Path, log: str = "") -> Replay:
     """The drive of a run folder.
 
     Args:
-      folder: of the run. log: name of one of its logs; the first that measured positions if empty.
+      folder: of the run. log: name of one of its logs; if empty the first that measured positions, or all windows of
+        a run that was cut into such.
 
     Returns:
       The measured course, that of each model, and the channels in which the last model is worst.
 
     Raises:
-      UserError: no run, no such log, a log without positions, or a model that cannot be loaded any more.
+      UserError: no run, no such log, a log that tells no way, or a model that cannot be loaded any more.
     """
     folder = Path(folder)
     result = read_result(folder)
     traces = result.traces
     if traces is None:
         raise UserError(f"{folder}: holds no series.npz yet; make it with lunar-mjx compare.")
-    number = _log(folder, traces, log)
+    stored = read_stored(folder / WINDOWS_FILE)
+    windows = windows_of(stored, traces, log)
+    number = 0 if windows else _log(folder, traces, log, sorted({one.name for one in windows_of(stored, traces)}))
     model = result.model
     if model is None:
         raise UserError(f"{folder}: its model cannot be loaded here, and brings the rover; run lunar-mjx compare anew.")
-    name = traces.observations.logs[number]
     labels = [_label(result, label) for label in traces.labels]
+    if windows:
+        measured, *courses = (
+            way_of(label, traces, windows, row) for row, label in ((None, "measured"), *enumerate(labels))
+        )
+        channels = traces.channels
+        told = {channel: rows_of(traces, windows, channel) for channel in channels}
+        parts = [(one.shown, one.label) for one in windows]
+        return Replay(model, folder.resolve().name, measured, courses, _worst(traces, told), parts)
+    name = traces.observations.logs[number]
     courses = [_course(label, traces, number, row, model.rover) for row, label in enumerate(labels)]
-    return Replay(model, name, _course("measured", traces, number, None, model.rover), courses, _worst(traces, number))
+    mine = [s for s in traces.observations.series if s.log == number]
+    told = {s.channel: (traces.time[s.start : s.stop], np.arange(s.start, s.stop)) for s in mine}
+    return Replay(model, name, _course("measured", traces, number, None, model.rover), courses, _worst(traces, told))
 
 
 def _label(result: Result, label: str) -> str:
@@ -51,8 +68,8 @@ def _label(result: Result, label: str) -> str:
     return f"with {added}, refitted" if label == "refitted" and added else label
 
 
-def _log(folder: Path, traces: Traces, wanted: str) -> int:
-    """Number of the log to show."""
+def _log(folder: Path, traces: Traces, wanted: str, in_windows: Sequence[str]) -> int:
+    """Number of the log to show, which is none of those that can be shown in windows."""
     o = traces.observations
     placed = [
         i for i in range(len(o.logs)) if _series(traces, i, "position_x_m") and _series(traces, i, "position_y_m")
@@ -61,8 +78,15 @@ def _log(folder: Path, traces: Traces, wanted: str) -> int:
         raise bad_input(folder, "--log", wanted, "is none of its logs", f"use one of {', '.join(o.logs)}")
     chosen = [i for i in placed if not wanted or o.logs[i] == wanted]
     if not chosen:
-        remedy = f"use one of {', '.join(o.logs[i] for i in placed)}" if placed else "look at it with lunar-mjx studio"
-        raise bad_input(folder, "--replay", wanted or folder.name, "measured no positions to put a rover at", remedy)
+        usable = [o.logs[i] for i in placed] or in_windows
+        remedy = f"use one of {', '.join(usable)}" if usable else "look at it with lunar-mjx studio"
+        raise bad_input(
+            folder,
+            "--replay",
+            wanted or folder.name,
+            "measured no positions to put a rover at, nor in windows a speed ahead and a yaw rate",
+            remedy,
+        )
     return chosen[0]
 
 
@@ -126,18 +150,16 @@ def _direction(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.unwrap(yaw)
 
 
-def _worst(traces: Traces, log: int) -> list[Trace]:
-    """Channels in which the last model leaves most, worst first."""
-    mine = [s for s in traces.observations.series if s.log == log and s.stop > s.start]
-    left = {s.channel: float(np.nanmean(traces.residual[-1, s.start : s.stop] ** 2)) for s in mine}
-    ranked = sorted(mine, key=lambda s: -left[s.channel])[:_MOST_TRACES]
-    return [
-        Trace(
-            channel_label(s.channel),
-            traces.time[s.start : s.stop],
-            traces.observations.value[s.start : s.stop],
-            traces.predicted[:, s.start : s.stop],
-            traces.residual[:, s.start : s.stop],
-        )
-        for s in ranked
-    ]
+def _worst(traces: Traces, told: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[Trace]:
+    """Channels in which the last model leaves most, worst first.
+
+    Args:
+      traces: of the run. told: times, s, and numbers of a channel's observations, -1 where its curve is interrupted.
+    """
+    left = {c: float(np.nanmean(traces.residual[-1, at[at >= 0]] ** 2)) for c, (_, at) in told.items() if len(at)}
+    out = []
+    for channel in sorted(left, key=lambda c: -left[c])[:_MOST_TRACES]:
+        time, at = told[channel]
+        values = (traces.observations.value, traces.predicted, traces.residual)
+        out.append(Trace(channel_label(channel), time, *(np.where(at < 0, np.nan, v[..., at]) for v in values)))
+    return out

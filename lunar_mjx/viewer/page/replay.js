@@ -208,6 +208,8 @@ export class Replay {
     this.fetchDust();
     const gap = Math.hypot(ghost[body][0] - measured[body][0], ghost[body][1] - measured[body][1]);
     byId("gap").textContent = `The model is ${gap.toFixed(2)} m away from where the rover was.`;
+    const part = this.scene.replay.parts.findLast((p) => p.begin <= this.time + 1e-6);
+    if (part) byId("replay-title").textContent = part.title;
     byId("clock").textContent = `${(this.time - this.times[0]).toFixed(1)} of ${(this.times.at(-1) - this.times[0]).toFixed(1)} s`;
     byId("when").value = this.time;
     this.plots.forEach((plot) => plot.show(this.time));

@@ -70,7 +70,7 @@ def make_run(folder, log):
     run.write()
     save_model(model, folder / "fitted.toml")
     noise = [dataclasses.asdict(Noise(NOISE.get(c, 1.0), 0.0, 1.0)) for c in CHANNELS]
-    run.save("windows.json", {"interval_s": INTERVAL, "noise": noise})
+    run.save("windows.json", {"window_s": 2.0, "interval_s": INTERVAL, "used": [], "noise": noise})
     proportions = [dataclasses.asdict(Proportion()) for _ in CHANNELS]
     run.save(
         RESTLESS_FILE, {"restlessness": dataclasses.asdict(Restlessness()), "proportions": proportions, "windows": 0}
