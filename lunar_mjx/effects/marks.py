@@ -1,11 +1,14 @@
 """Marks on parts of a step, by which a batch on a GPU knows what it may compute as one kernel.
 
-A marked part is an ordinary jitted function: elsewhere, and where no kernel can be made of it, nothing changes.
+Marks are made only where a step is traced for them, inside `marking`. Everywhere else a part is called as it stands: a
+jitted function in a step would be compiled by itself where the step is not, and round otherwise than its operations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -13,9 +16,23 @@ import jax
 BY_WHEEL = "by_wheel_"
 """How the names of marked functions begin; the number of wheels follows."""
 
+_marks: ContextVar[bool] = ContextVar("marks", default=False)
+
+
+@contextmanager
+def marking() -> Iterator[None]:
+    """Within it, `by_wheel` marks: for tracing a step whose parts become kernels."""
+    token = _marks.set(True)
+    try:
+        yield
+    finally:
+        _marks.reset(token)
+
 
 def by_wheel(function: Callable[[], Any], wheels: int) -> Any:
     """The result of a function without arguments that treats so many wheels alike, arrays over which end with them."""
+    if not _marks.get():
+        return function()
 
     def marked() -> Any:
         return function()

@@ -9,6 +9,7 @@ has no rule below goes through `jax.vmap`, primitive by primitive.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend import core
 
-from lunar_mjx.effects.marks import BY_WHEEL
+from lunar_mjx.effects.marks import BY_WHEEL, marking
 
 _ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "clamp",
@@ -53,9 +54,10 @@ def batch_last(
             leaf if a is None else jax.ShapeDtypeStruct(_without(leaf.shape, a), leaf.dtype)
             for leaf, a in zip(leaves, flat_axes, strict=True)
         ]
-        closed, shapes = jax.make_jaxpr(lambda *x: function(*jax.tree.unflatten(treedef, x)), return_shape=True)(
-            *(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in single)
-        )
+        with nullcontext() if part is None else marking():
+            closed, shapes = jax.make_jaxpr(lambda *x: function(*jax.tree.unflatten(treedef, x)), return_shape=True)(
+                *(jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in single)
+            )
         size = next(leaf.shape[a] for leaf, a in zip(leaves, flat_axes, strict=True) if a is not None)
         values = [_Value(leaf, a) for leaf, a in zip(leaves, flat_axes, strict=True)]
         out = _run(closed.jaxpr, closed.consts, values, [True] * len(closed.jaxpr.outvars), part)
