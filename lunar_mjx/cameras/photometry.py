@@ -167,9 +167,20 @@ class Film:
         # A camera that exposed for a set Sun would show noise.
         mu0 = jnp.maximum(sun_height, LOWEST_SUN)
         # across the light, the cosine between viewer and light is the product of their heights
-        return self.mid / soil.radiance_factor(mu0, _METERED, mu0 * _METERED)
+        return self.mid / soil.radiance_factor(mu0, METERED, mu0 * METERED)
+
+    def shown(self, soil: Regolith, mu0: Any, mu: Any, sun_height: Any) -> Any:
+        """What a screen shows of sunlit soil on faces that are not level, 0 and more.
+
+        Args:
+          soil: how it reflects. mu0, mu: cosines between their normals and the Sun, and the viewer, of any shape.
+          sun_height: sine of the Sun's elevation. Across the light stands the viewer, as `gain` has it.
+        """
+        metered = soil.radiance_factor(mu0, mu, jnp.maximum(sun_height, LOWEST_SUN) * METERED)
+        return (self.gain(soil, sun_height) * metered) ** (1.0 / self.gamma)
 
 
 LOWEST_SUN = math.sin(math.radians(2.0))
 """Sine of the elevation below which no exposure makes up for the Sun."""
-_METERED = math.sin(math.radians(20.0))
+METERED = math.sin(math.radians(20.0))
+"""Cosine between level ground's normal and the viewer for whom `Film` exposes."""

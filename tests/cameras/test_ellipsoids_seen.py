@@ -68,12 +68,13 @@ def test_the_drawn_shape_is_the_one_that_wheels_meet() -> None:
     """MuJoCo's scene, the map's outline and the web page's ball against the ellipsoid itself."""
     terrain = _stone()
     model, _ = build_scene(load_rover("luvmi_x"), terrain, np.array([[4.0, 0.0]]), SUN)
-    geom = next(g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-    turn = np.zeros(9)
+    geom = next(g for g in range(model.ngeom) if model.geom(g).name.startswith("rock_"))
+    turn, mesh = np.zeros(9), model.geom_dataid[geom]
     mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    shape = turn.reshape(3, 3) * model.geom_size[geom] ** -1.0
-    np.testing.assert_allclose(shape @ shape.T, SCALED.T @ SCALED, atol=1e-4)
-    np.testing.assert_allclose(model.geom_pos[geom], CENTRE, atol=1e-6)
+    corners = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
+    drawn = model.geom_pos[geom] + corners @ turn.reshape(3, 3).T
+    np.testing.assert_allclose(np.linalg.norm((drawn - CENTRE) @ SCALED.T, axis=1), 1.0, atol=1e-4)
+    np.testing.assert_allclose(model.geom_pos[geom], CENTRE, atol=1e-4)
     outline = rocks_within(terrain, np.array([-10.0, -10.0]), np.array([10.0, 10.0]))
     assert outline.shape == (1, 5)
     for corner in ring(outline[0]):

@@ -23,8 +23,9 @@ from lunar_mjx.cameras import (
 from lunar_mjx.cameras.camera import Images
 from lunar_mjx.cameras.chase import Chase
 from lunar_mjx.cameras.ground_map import MAP_COLOURS
+from lunar_mjx.cameras.scene import near_and_far
 from lunar_mjx.rover import load_rover
-from lunar_mjx.terrain import Terrain, build_rocks, flat
+from lunar_mjx.terrain import HeightField, Terrain, build_rocks, flat
 
 GROUND, ROCK = 1, 2
 EYE = Pinhole(160, 120, 45.0)
@@ -48,8 +49,10 @@ def in_jax(terrain: Terrain, pose: Pose, sun: Sun, **more: object) -> Pictures:
     return jax.tree.map(np.asarray, draw(*given))
 
 
-def seen_by_both(opengl: tuple[str, ...], plain: Terrain, sun: Sun) -> tuple[Pose, Images, Pictures]:
-    pose = look_at((0.0, 0.0, 5.0), (30.0, 0.0, 0.0))
+def seen_by_both(
+    opengl: tuple[str, ...], plain: Terrain, sun: Sun, to: tuple[float, float, float] = (30.0, 0.0, 0.0)
+) -> tuple[Pose, Images, Pictures]:
+    pose = look_at((0.0, 0.0, 5.0), to)
     with RoverCamera(load_rover("luvmi_x"), plain, camera=EYE, sun=sun, largest=(160, 120), backends=opengl) as camera:
         qpos = camera.model.qpos0.copy()
         qpos[:3] = -3.0, 0.0, 0.3
@@ -105,9 +108,74 @@ def test_both_expose_a_low_sun_alike(opengl: tuple[str, ...], plain: Terrain, el
     red, levels = drawn.rgba[..., 0] / 255.0, {}
     for name, colour, label in (("gl", red, drawn.segmentation), ("jax", found.rgb[..., 0], found.label)):
         # of a rock half is dark at any exposure, and its Sun's side burns out
-        levels[name] = np.median(colour[label == GROUND]), np.mean(colour[label == ROCK] > 0.3)
+        lit = colour[(label == ROCK) & (colour > 0.3)]
+        levels[name] = np.median(colour[label == GROUND]), np.mean(colour[label == ROCK] > 0.3), np.median(lit)
     assert levels["gl"][0] == pytest.approx(levels["jax"][0], rel=0.15)
     assert levels["gl"][1] == pytest.approx(levels["jax"][1], abs=0.1)
+    assert levels["gl"][2] == pytest.approx(levels["jax"][2], rel=0.15)
+
+
+@pytest.mark.parametrize("elevation_deg", [6.0, 2.0])
+def test_rough_ground_in_a_low_sun_looks_alike_in_both(opengl: tuple[str, ...], elevation_deg: float) -> None:
+    """By all quarters of its brightness at 6 degrees; at 2 half of the ground is dark."""
+    at = np.arange(-24.0, 24.05, 0.2)
+    x, y = np.meshgrid(at, at)
+    heights = 0.15 * np.sin(0.9 * x) * np.cos(0.7 * y) + 0.02 * np.sin(5.0 * x + 3.0 * y)
+    field = HeightField(*(jnp.asarray(v, jnp.float32) for v in (heights, -24.0, -24.0, 0.2)))
+    rough, sun = Terrain(field, None, None, jnp.zeros(3), "rough"), Sun(180.0, elevation_deg)
+    _, drawn, found = seen_by_both(opengl, rough, sun, to=(14.0, 0.0, 0.0))
+    ground = (drawn.segmentation == GROUND) & (found.label == GROUND) & (found.depth < 25.0)
+    drawn, found = drawn.rgba[..., 0][ground] / 255.0, found.rgb[..., 0][ground]
+    assert np.mean(drawn > 0.2) == pytest.approx(np.mean(found > 0.2), abs=0.05)
+    for share in (0.25, 0.5, 0.75, 0.9):
+        levels = [np.quantile(v[v > 0.2], share) for v in (drawn, found)]
+        assert levels[0] == pytest.approx(levels[1], rel=0.2), share
+
+
+def test_fine_and_coarse_ground_meet_without_a_shadow(opengl: tuple[str, ...]) -> None:
+    """Fine ground ends 15 m away; a coarse one 5 cm lower lay in its shadow."""
+    with RoverCamera(
+        load_rover("luvmi_x"), flat(160.0), camera=EYE, sun=Sun(250.0, 6.0), largest=(160, 120), backends=opengl
+    ) as camera:
+        away = camera.model.qpos0.copy()
+        away[:3] = -3.0, -5.0, 0.3
+        camera.place(away)
+        images = camera.take(look_at((0.0, 0.0, 5.0), (30.0, 0.0, 0.0)))
+    ground = images.rgba[..., 0][images.segmentation == GROUND].astype(float)
+    assert ground.min() > 0.6 * np.median(ground)
+
+
+def test_fine_ground_lies_on_the_edges_of_the_coarse_one() -> None:
+    """Also where the grid is no multiple of the coarse cells, and in its corner."""
+    at = 0.1 * np.arange(807)
+    x, y = np.meshgrid(at, at[:640])
+    field = HeightField(np.sin(x) * np.cos(0.8 * y), 0.0, 0.0, 0.1)
+    terrain = Terrain(field, None, None, np.zeros(3), "hills")
+    for low, high in (((20.0, 20.0), (50.0, 50.0)), ((0.0, 40.0), (30.0, 63.9)), ((70.0, 50.0), (80.6, 63.9))):
+        near, far = near_and_far(terrain, np.array(low), np.array(high))
+        assert far is not None
+        assert (np.array(near.low) <= np.array(low) + 1e-9).all()
+        assert (np.array(near.high) >= np.array(high) - 0.1 * np.ceil(807 / 159) * np.ones(2) - 1e-9).all()
+        rows, cols = near.heights.shape
+        east, north = (np.linspace(a, b, n) for a, b, n in zip(near.low, near.high, (cols, rows), strict=True))
+        far_east, far_north = (
+            np.linspace(a, b, n) for a, b, n in zip(far.low, far.high, far.heights.shape[::-1], strict=True)
+        )
+        for edge in (0, -1):
+            if 0.0 < east[edge] < far_east[-1] - 1e-6:
+                column = np.abs(far_east - east[edge]).argmin()
+                assert abs(far_east[column] - east[edge]) < 1e-6
+                covered = north <= far_north[-1] + 1e-6
+                coarse = np.interp(north[covered], far_north, far.heights[:, column])
+                np.testing.assert_allclose(near.heights[covered, edge], coarse, atol=1e-6)
+            if 0.0 < north[edge] < far_north[-1] - 1e-6:
+                row = np.abs(far_north - north[edge]).argmin()
+                assert abs(far_north[row] - north[edge]) < 1e-6
+                covered = east <= far_east[-1] + 1e-6
+                coarse = np.interp(east[covered], far_east, far.heights[row])
+                np.testing.assert_allclose(near.heights[edge, covered], coarse, atol=1e-6)
+        # within, the ground that wheels touch
+        assert near.heights[5, 5] == pytest.approx(np.sin(east[5]) * np.cos(0.8 * north[5]), abs=1e-6)
 
 
 def test_tracks_lie_at_the_same_place_in_both(opengl: tuple[str, ...]) -> None:
