@@ -99,7 +99,9 @@ OUTPUTS: dict[str, Callable[[Path], object]] = {
     "drive.csv": lambda p: write_frame(_frame(), p),
     "drive.parquet": lambda p: write_frame(_frame(), p),
     "run.json": lambda p: save_json(p, {"numbers": list(range(500))}),
-    "x.answer.toml": lambda p: write_answer(Answer("log", "0" * 64, 0, "paper", "slope", 1.0, [], {}, "0" * 64), p),
+    "x.answer.toml": lambda p: write_answer(
+        Answer("log", "0" * 64, 0, "paper", "slope", 1.0, [], {}, "0" * 64, "0" * 64), p
+    ),
     "policy.npz": _policy,
     "report.html": _page,
     "plane.stl": lambda p: export_mesh(inclined(0.1, extent=8.0), p),

@@ -21,7 +21,7 @@ from lunar_mjx.logs.log import Log
 from lunar_mjx.logs.readers.folder import ANSWER, LOG_FILE, read_log
 from lunar_mjx.toml_fields import Fields
 
-FORMAT = "lunar-mjx-answer/1"
+FORMAT = "lunar-mjx-answer/2"
 PREFIX = "sha256:"
 
 
@@ -35,6 +35,7 @@ class Answer:
       effects: name, whether it was added, and parameters of each hidden effect.
       recording: noise, biases and losses.
       data_sha256: of the tables, so that neither side can change them.
+      log_sha256: of what `log.toml` says beside its commitment: another gravity or start is another drive.
     """
 
     log: str
@@ -46,17 +47,21 @@ class Answer:
     effects: Sequence[Mapping[str, Any]]
     recording: Mapping[str, Any]
     data_sha256: str
+    log_sha256: str
 
     def commitment(self) -> str:
         """SHA-256 of everything above, in one canonical spelling."""
-        # One spelling: a hash of the same content must not depend on the order of keys.
-        text = json.dumps(dataclasses.asdict(self), sort_keys=True, separators=(",", ":"))
-        return PREFIX + hashlib.sha256(text.encode()).hexdigest()
+        return PREFIX + _hash(dataclasses.asdict(self))
 
     @property
     def hidden(self) -> tuple[str, ...]:
         """Names of the effects that the model lacks."""
         return tuple(e["name"] for e in self.effects if e["added"])
+
+
+def _hash(content: Mapping[str, Any]) -> str:
+    """SHA-256 of some content in one spelling, which does not depend on the order of keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def answer_path(out: Path) -> Path:
@@ -136,6 +141,21 @@ def log_hash(log: Log) -> str:
     return hash_tables(frames)
 
 
+def hash_settings(folder: Path) -> str:
+    """SHA-256 over what a log's `log.toml` says, but for its commitment, in which the hash itself is hidden."""
+    said = {k: v for k, v in Fields.read(folder / LOG_FILE).values.items() if k != "commitment"}
+    # As text, since TOML has dates and times, which JSON does not know.
+    return _hash(json.loads(json.dumps(said, default=str)))
+
+
+def commit(folder: Path, answer: Answer) -> Answer:
+    """The answer with the hash of a log's settings; the log gets the commitment to it."""
+    answer = dataclasses.replace(answer, log_sha256=hash_settings(folder))
+    said = Fields.read(folder / LOG_FILE).values
+    write_text(folder / LOG_FILE, tomli_w.dumps({**said, "commitment": answer.commitment()}))
+    return answer
+
+
 def unseal(answer: str | Path, log: str | Path, verdict: str | Path | None = None) -> dict[str, Any]:
     """Opens an answer: is it the one that the log was sealed with, and did the colleague find it?
 
@@ -149,7 +169,7 @@ def unseal(answer: str | Path, log: str | Path, verdict: str | Path | None = Non
       (within the named class), missed, false alarm or wrong.
 
     Raises:
-      UserError: the log is not sealed, or neither with this answer nor with these data.
+      UserError: the log is not sealed, or not with this answer, these tables and this `log.toml`.
     """
     given, sealed = read_answer(answer), read_log(log)
     path = Path(log) / LOG_FILE
@@ -160,6 +180,8 @@ def unseal(answer: str | Path, log: str | Path, verdict: str | Path | None = Non
         raise UserError(f"{answer}: is not the answer that {log} was sealed with; ask its sender for the right file.")
     if not isinstance(sealed, Log) or log_hash(sealed) != given.data_sha256:
         raise UserError(f"{log}: its tables were changed after it was sealed; ask its sender for the log.")
+    if hash_settings(Path(log)) != given.log_sha256:
+        raise UserError(f"{path}: was changed after the log was sealed; ask its sender for the log.")
     result: dict[str, Any] = {"sealed": True, "hidden": list(given.hidden), "effects": [dict(e) for e in given.effects]}
     if verdict is not None:
         label, effects = read_verdict(verdict)

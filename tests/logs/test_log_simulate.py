@@ -118,9 +118,21 @@ def test_a_seal_opens_with_its_answer_only(fast: None, tmp_path: Path) -> None:
         unseal(answer_path(log), log)
     answer_path(log).write_text(text)
     table = log / "thermal.csv"
-    table.write_text(table.read_text().replace("25.", "26.", 1))
+    kept = table.read_text()
+    table.write_text(kept.replace("25.", "26.", 1))
     with pytest.raises(UserError, match="tables were changed"):
         unseal(answer_path(log), log)
+    table.write_text(kept)
+    said = log / "log.toml"
+    text = said.read_text()
+    assert "gravity_m_s2 = 1.62" in text
+    for old, new in (("gravity_m_s2 = 1.62", "gravity_m_s2 = 1.63"), ('rover = "luvmi_x"', 'rover = "viper"')):
+        said.write_text(text.replace(old, new))
+        with pytest.raises(UserError, match=r"log\.toml: was changed after the log was sealed; ask its sender"):
+            unseal(answer_path(log), log)
+    # written anew with the same content, such as by another editor
+    said.write_text("# looked at\n" + text)
+    assert unseal(answer_path(log), log)["sealed"]
 
 
 def test_a_sealed_folder_tells_nothing(fast: None, tmp_path: Path) -> None:
@@ -236,7 +248,7 @@ def test_every_verdict_can_be_scored() -> None:
     assert {v.label: v in naming for v in Verdict} == LABELS
 
 
-ANSWER = Answer("a", "0" * 64, 3, "consistent", "slope", 1.0, [], {"dropouts": 0.0}, "0" * 64)
+ANSWER = Answer("a", "0" * 64, 3, "consistent", "slope", 1.0, [], {"dropouts": 0.0}, "0" * 64, "0" * 64)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from lunar_mjx.logs.apply import log_model
 from lunar_mjx.logs.log import Imu, Log, LogTable
 from lunar_mjx.logs.recorder.instruments import Recording, record
 from lunar_mjx.logs.schema import SPLITS, find_channel
-from lunar_mjx.logs.seal import Answer, answer_path, hash_tables, write_answer
+from lunar_mjx.logs.seal import Answer, answer_path, commit, hash_tables, write_answer
 from lunar_mjx.logs.write import refuse_used, write_log
 from lunar_mjx.manoeuvres import Manoeuvre, commands, load_manoeuvre
 from lunar_mjx.model import LUNAR_GRAVITY, Model, make_model
@@ -117,14 +117,12 @@ def simulate_log(
     # The noise of a sealed log must not be found by trying seeds.
     stream = np.random.default_rng([seed, int(nonce, 16)] if seal else seed)
     tables = record(time, signals, recording, stream)
-    answer = Answer(out.name, nonce, seed, preset, plan.name, scale, answers, dataclasses.asdict(recording), "")
+    answer = Answer(out.name, nonce, seed, preset, plan.name, scale, answers, dataclasses.asdict(recording), "", "")
     settings["source"] = {"who": "lunar-mjx log simulate", "licence": "CC0-1.0", "citation": "a simulated log"}
     channels = [c for t in tables.values() for c in t.columns if c != "time_s"]
     answer = dataclasses.replace(answer, data_sha256=hash_tables(tables))
-    if seal:
-        settings["commitment"] = answer.commitment()
     write_log(out, tables, rover=name, noise=recording.noise(channels), **settings)
-    write_answer(answer, answer_path(out))
+    write_answer(commit(out, answer) if seal else answer, answer_path(out))
     return out
 
 
