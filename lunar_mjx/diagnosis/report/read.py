@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from lunar_mjx.diagnosis.runs import (
     UNKNOWN_FILE,
     VERDICT_FILE,
 )
-from lunar_mjx.errors import UserError, bad_input, require_file
+from lunar_mjx.errors import UserError, bad_input, one_line, require_file
 from lunar_mjx.inference.observations import Observations, Series
 from lunar_mjx.model import Model
 from lunar_mjx.model.file import load_model
@@ -132,6 +133,27 @@ def read_result(folder: Path) -> Result:
     return Result(
         folder.resolve().name, run, comparison, verdict, audit, unknown, following, traces, signatures, folder
     )
+
+
+def require_whole(result: Result) -> None:
+    """Refuses a run of which only a part was copied: one comparison writes all that is looked for here.
+
+    Raises:
+      UserError: one of its files is missing, or the model's is torn.
+    """
+    folder = result.path
+    model = folder / MODEL_FILE
+    there = {COMPARISON_FILE: result.comparison is not None, SERIES_FILE: result.traces is not None}
+    found = [name for name, given in there.items() if given]
+    lacking = [name for name, given in {**there, MODEL_FILE: model.is_file()}.items() if not given]
+    remedy = "copy the whole folder of the run, or make it anew with lunar-mjx compare"
+    if found and lacking:
+        raise UserError(f"{folder / lacking[0]}: is missing beside {found[0]}; {remedy}.")
+    if model.is_file():
+        try:
+            tomllib.loads(model.read_text(encoding="utf-8-sig"))
+        except ValueError as error:  # an effect that is not here is no damage, a torn file is
+            raise UserError(f"{model}: is damaged ({one_line(error)[:150]}); {remedy}.") from None
 
 
 def _signatures(path: Path) -> dict[str, np.ndarray]:

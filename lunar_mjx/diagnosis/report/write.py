@@ -9,7 +9,7 @@ from pathlib import Path
 from lunar_mjx._version import __version__
 from lunar_mjx.diagnosis.report import explore, figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
-from lunar_mjx.diagnosis.report.read import Result, read_result
+from lunar_mjx.diagnosis.report.read import Result, read_result, require_whole
 from lunar_mjx.diagnosis.report.steps import Step, chain, comparable, error, judged
 from lunar_mjx.diagnosis.report.words import and_list, sigmas
 from lunar_mjx.diagnosis.verdict import Verdict
@@ -28,11 +28,13 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Path:
       Its path.
 
     Raises:
-      UserError: a folder is no run, or one of its files is damaged.
+      UserError: a folder is no run, or one of its files is damaged, or missing beside what is written with it.
     """
     if not runs:
         raise UserError("report: no run is given; give at least one run folder.")
     results = [read_result(Path(run)) for run in runs]
+    for result in results:
+        require_whole(result)
     # The last that was diagnosed: a chain may end in a comparison of which nobody has asked why.
     judge = next((r for r in reversed(results) if r.verdict), results[-1])
     steps = chain(results)

@@ -13,6 +13,13 @@ HOSTILE = "</script><img src=x onerror='document.title=1'><b>"
 POINTS = 24
 
 
+def complete(folder: Path) -> Path:
+    """The run with the other files that a comparison writes, as far as a report asks for them."""
+    (folder / "comparison.json").write_text('{"as_given": {}, "refitted": {}, "by_channel": []}', encoding="utf-8")
+    (folder / "model.toml").write_text("", encoding="utf-8")
+    return folder
+
+
 def write_run(folder: Path, table: bool, hostile: str = "") -> Path:
     """A run of two manoeuvres, the second held out: an effect `drag` is refitted, `toe` is not.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from chromium import Browser
-from small_run import HOSTILE, write_run
+from small_run import HOSTILE, complete, write_run
 
 from lunar_mjx.diagnosis.report import write_report
 from lunar_mjx.report.style import DARK, DARK_SHADES, PAPER, SHADES
@@ -20,7 +20,7 @@ DRAWN = "document.getElementById('figure-2')"
 
 @pytest.fixture(params=[True, False], ids=["table", "drive"])
 def page(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return write_report([write_run(tmp_path / "run", request.param, HOSTILE)], tmp_path / "report.html")
+    return write_report([complete(write_run(tmp_path / "run", request.param, HOSTILE))], tmp_path / "report.html")
 
 
 def colour(text: str) -> str:
@@ -82,7 +82,7 @@ def test_words_do_not_collide_and_a_phone_scrolls_no_page_sideways(page: Path, b
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_figures_follow_the_page_into_the_dark(tmp_path: Path, browser: Browser, dark: bool) -> None:
-    page = write_report([write_run(tmp_path / "run", True)], tmp_path / "report.html")
+    page = write_report([complete(write_run(tmp_path / "run", True))], tmp_path / "report.html")
     browser.dark(dark)
     browser.open(page.as_uri())
     browser.wait("document.body?.dataset.ready")

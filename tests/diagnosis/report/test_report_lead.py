@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from small_run import write_run
+from small_run import complete, write_run
 
 from lunar_mjx.diagnosis.report import figures, tables
 from lunar_mjx.diagnosis.report.lead import lead
@@ -20,6 +20,7 @@ from lunar_mjx.diagnosis.report.steps import Error
 from lunar_mjx.diagnosis.report.write import _audit_line, _verdict, write_report
 from lunar_mjx.diagnosis.verdict import Verdict
 from lunar_mjx.diagnosis.weighed.answer import parameter_table
+from lunar_mjx.errors import UserError
 from lunar_mjx.inference.coordinates import FACTOR_UNIT, NUISANCE, Coordinate
 
 
@@ -272,9 +273,24 @@ def test_starts_and_instruments_have_a_table_of_their_own():
 
 
 def test_a_campaign_of_many_drives_makes_no_paragraph_of_the_title(tmp_path):
-    folder = write_run(tmp_path / "run", table=False)
+    folder = complete(write_run(tmp_path / "run", table=False))
     run = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     run["logs"] = [str(tmp_path / f"drive_{k}") for k in range(9)]
     (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
     page = write_report([folder], tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<h1>Criticism of a model: drive_0, drive_1, drive_2, drive_3 and 5 more</h1>" in page
+
+
+@pytest.mark.parametrize("name", ["comparison.json", "series.npz", "model.toml"])
+def test_a_run_that_was_copied_in_part_is_refused_in_a_sentence(name, tmp_path):
+    """A file is missing or torn: the report said nothing of it, and left out what stands there."""
+    folder = complete(write_run(tmp_path / "run", table=False))
+    (folder / "model.toml").write_text('preset = "consistent"', encoding="utf-8")
+    write_report([folder], tmp_path / "report.html")
+    content = (folder / name).read_bytes()
+    (folder / name).unlink()
+    with pytest.raises(UserError, match=rf"{name}: is missing beside .*; copy the whole folder of the run, or make it"):
+        write_report([folder], tmp_path / "report.html")
+    (folder / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match=rf"{name}: is damaged \(.*lunar-mjx compare"):
+        write_report([folder], tmp_path / "report.html")
