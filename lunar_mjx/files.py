@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -10,6 +11,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from lunar_mjx.errors import UserError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What the operating system says of a full disk: another folder would often be no remedy, such as for a run."""
 
 
 @contextmanager
@@ -107,6 +111,8 @@ def only_writer(folder: Path, name: str, what: str) -> IO[str]:
 
 
 def _refused(path: Path, error: OSError) -> UserError:
+    if error.errno in _FULL:
+        return UserError(f"{path}: cannot be written ({error.strerror or error}); make room there and run it again.")
     return UserError(
         f"{path}: cannot be written ({error.strerror or error}); name a folder that exists, with room and permission "
         "to write."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import errno
 import importlib.util
 import itertools
 import json
@@ -164,6 +165,20 @@ def _bed_results(pull: float) -> list[dict]:
     points = [Point(s, a, 50.0, 1.0, 1.0 - s) for s in (0.1, 0.3) for a in (0.0, 20.0)]
     runs = campaign.plan(WHEEL, SAND, 9.81, points, NUMERICS, controls=1)
     return [fake_result(r, drawbar_pull=pull + r.point.slip_ratio + 0.1 * len(r.variant)) for r in runs]
+
+
+def test_a_run_on_a_full_disk_is_told_to_make_room(tmp_path, monkeypatch):
+    """Not to name another folder: `why` has none to name."""
+    path = tmp_path / "verdict.json"
+    save_json(path, {"verdict": "KNOWN"})
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match=r"verdict\.json: cannot be written \(.*\); make room there and run it again"):
+        save_json(path, {"verdict": "UNKNOWN"})
+    assert json.loads(path.read_text()) == {"verdict": "KNOWN"} and [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 def test_a_disk_that_is_full_keeps_the_old_table_of_a_bed(tmp_path):
