@@ -20,7 +20,8 @@ from lunar_mjx.visual.recorded import RecordedDrive
 class OverlayColours:
     """Colours of the overlay, red, green, blue and opacity."""
 
-    glass: tuple[int, ...] = (10, 12, 16, 170)
+    glass: tuple[int, ...] = (10, 12, 16, 225)
+    """So dark that no bright rock behind it passes for a minus sign."""
     text: tuple[int, int, int] = (240, 240, 240)
     faint: tuple[int, int, int] = (150, 155, 160)
     path: tuple[int, int, int] = (120, 190, 255)

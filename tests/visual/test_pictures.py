@@ -140,6 +140,8 @@ def test_numbers_lie_within_their_pane(luvmi):
     text = (shown[10:140, : edge + 1] > 620) & glass[10:140, [100]]
     rightmost = int(np.nonzero(text.any(axis=0))[0].max())
     assert rightmost < edge - 4
+    # A rock behind the glass stood as "-" before a number: over white it is a fifth as bright as a screen at most.
+    assert shown[12, edge - 3] < 0.2 * 3 * 255
 
 
 def test_rear_wheels_are_broken_lines():
