@@ -32,9 +32,8 @@ class DriveSettings(SearchSettings):
     errors: tuple[float, ...] = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
     """1; sizes of that error which are tried."""
     annealing: tuple[float, ...] = (0.3, 0.1, 0.03, 0.01)
-    """1; least sizes of that error, one after the other, by which the refit of the model as it is is led from the model
-    as given; the last of them leads all others. On a foreign campaign of a Husky with late actuators the truth ends
-    6,500 nats above the model as it is so, else 800."""
+    """1; least sizes of that error, one after the other, by which every refit is led. On a foreign campaign of a Husky
+    with late actuators the truth ends 6,500 nats above the model as it is so, else 800."""
     error_times_s: tuple[float, ...] = (1.0, 10.0)
     """s; how long such an error lasts, which are tried: where a law is off, a wheel's speed errs for about a second,
     and its angle, as the sum of that, for all of a drive."""

@@ -147,7 +147,7 @@ def test_a_descent_ends_where_jumps_hide_what_its_slopes_promise():
 
 
 def test_what_was_raced_is_refitted_from_where_the_race_has_brought_it_with_errors_of_its_own(monkeypatch):
-    """Led by the least errors; afterwards all is again as for the model as it is."""
+    """Led by errors that lessen; afterwards all is again as for the model as it is."""
     form = DriveForm(Toy({"a": 1.5, "b": -0.8, "drag": 3.0}), DriveSettings())  # type: ignore[arg-type]
     base = form.refit(frozenset(), None, None)
     led, begun, lead, approach = [], [], OwnRefit.lead, OwnRefit.approach
@@ -159,9 +159,9 @@ def test_what_was_raced_is_refitted_from_where_the_race_has_brought_it_with_erro
     form.promising(base)
     drag, both = frozenset({"drag"}), frozenset({"drag", "lag"})
     found = form.refit(drag, base, form.trial(base.u, "drag"))
-    # once by the least errors, then by its own
-    assert len(led) == 1 and len(begun) == 2
-    assert led[0][0] is form._refits.raced[frozenset(), drag] and led[0][2] == (0.01,)
+    # by errors that lessen as for the model as it is, then by its own
+    assert len(led) == 1 and len(begun) == len(DriveSettings().annealing) + 1
+    assert led[0][0] is form._refits.raced[frozenset(), drag]
     assert found.u[:3] == pytest.approx([1.5, -0.8, 3.0], abs=0.3)
     assert found.linear.log_scale != base.linear.log_scale
     assert form.errors is errors and np.array_equal(form._derivatives.steps, steps)
@@ -170,7 +170,7 @@ def test_what_was_raced_is_refitted_from_where_the_race_has_brought_it_with_erro
     # beside drag nothing was raced, and without it nothing: both begin there, one with a lag that acts
     form.refit(both, found, None)
     form.refit(frozenset(), found, None)
-    assert len(led) == 3 and len(begun) == 6
+    assert len(led) == 3 and len(begun) == 3 * (len(DriveSettings().annealing) + 1)
     assert led[1][0][:3] == pytest.approx(found.u[:3])
     assert led[2][0][:2] == pytest.approx(found.u[:2]) and led[2][0][2] == 0.0
 
@@ -563,7 +563,8 @@ def test_a_refit_that_has_arrived_simulates_little():
     form, found, _ = asked(toy)
     before = toy.rows
     form.refit(found.best.effects, found.best.refit, None)
-    assert toy.rows - before < 30
+    # few at each size of errors that leads it, and at its end
+    assert toy.rows - before < 13 * (len(DriveSettings().annealing) + 1)
 
 
 def test_a_step_ends_at_a_bound_and_the_others_do_their_best():
