@@ -166,7 +166,7 @@ class OwnRefit:
 
         With errors of its own, which begin anew and lead it as they led the model as it is: by the errors of another it
         would have to explain what that one has taken for errors. (Led by the least of them alone, the hidden delay of
-        a foreign Husky's actuators ended at half of its size, 4,700 nats lower.)
+        a foreign Husky's actuators ended at half of its size, 4,300 nats lower.)
 
         Args:
           u: (coordinates,) where from. free: coordinates that are moved.
